@@ -159,7 +159,7 @@ def measure(
     timing, _ = trial.measure(REPEATS, WARM_UP, BUDGET)
     row = dict(us=1e6 * timing.median, p10_us=1e6 * timing.low, p90_us=1e6 * timing.high, error=error)
     row |= dict(launches=len(launched), compile_s=trial.first_call, granularity=dyn.granularity)
-    return row | dict(stretch=dyn.plan.stretch)
+    return row | dict(stretch=dyn.plan.block_length)
 
 
 def trial_of(

@@ -145,7 +145,7 @@ def candidates(dyn: spo.Dynamics, operation: str) -> list[str]:
     """Return the granularities at which the operation can run, and that are worth timing."""
     routine = dyn._operations[operation].routine
     assert routine is not None
-    limbs = bool(routine.letters) and 1 < dyn.plan.limbs <= 16
+    limbs = bool(routine.letters) and 1 < dyn.plan.leaf_segments <= 16
     return ["tree", *["segment"] * limbs, *["node"] * (routine.has_node_form and dyn.worlds <= NODE_WORLDS)]
 
 
@@ -175,7 +175,7 @@ def compare(name: str, operation: str, worlds: int, device: str | None, leave: i
                 each.measure()
     times = {granularity: each.us for granularity, each in timed.items()}
     ratio = times[PLAN if PLAN in times and chosen != "node" else chosen] / min(times.values())
-    row = dict(scene=name, dofs=scene.dof_count, limbs=planned.plan.limbs, operation=operation, worlds=worlds)
+    row = dict(scene=name, dofs=scene.dof_count, limbs=planned.plan.leaf_segments, operation=operation, worlds=worlds)
     return row | dict(us=times, chosen=chosen, ratio=ratio, error=max(errors))
 
 

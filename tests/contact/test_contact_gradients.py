@@ -104,7 +104,12 @@ BUGS = {
     "what passes begin with": (PassGradient, "stores", "select(kept.first, way, 0.0)", "0.0"),
     "a load held": (PassGradient, "stores", "seeds += [1.0,", "seeds += [0.0,"),
     "a load held before": (PassSolve, "stores", "[*seeds, 1.0]", "[*seeds, 0.0]"),
-    "dampers left out": (PassSolve, "stores", "trace.stiffened = self._with_resistance", "trace.dampers = {}"),
+    "dampers left out": (
+        PassSolve,
+        "stores",
+        "trace.with_step_armature = self._with_resistance",
+        "trace.contact_inertia = {}",
+    ),
     "points that do not press": (PassSolve, "stores", "Vector(wrenches[6 * at", "0.0 * Vector(wrenches[6 * at"),
 }
 

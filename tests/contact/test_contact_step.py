@@ -211,7 +211,7 @@ BUGS = {
     "velocity terms of the path alone": (middle, "_kick", "forces.__getitem__", "zero"),
     "rates of the last round": (middle, "last_kick", "2.0 * (kick[dof] - kicked(dof))", "0.0"),
     "points along other rates": (points, "place_points", "w, v = mine.travel", "w, v = mine.twist"),
-    "forces at the start": (step.ContactStep, "__init__", 'trace.instead.pop("q", None)', "None"),
+    "forces at the start": (step.ContactStep, "__init__", 'trace.substitutes.pop("q", None)', "None"),
     "points half way": (points, "place_points", "depth + (0.5 * h)", "depth + (0.4 * h)"),
     "weights of the neutral pose": (step.ContactStep, "_step_over_inertia", "not in single_dofs", "in single_dofs"),
     "straight paths": (points, "place_points", "(0.5 * h) * faster", "0.0"),

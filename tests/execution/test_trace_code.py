@@ -25,10 +25,10 @@ TYPES = {"float32": wp.float32, "float64": wp.float64}
 def compiled(values, rows, dtype, device, fuses=False):
     """``values`` of inputs ("x", i) for rows [world, i], by a kernel."""
     T, count = TYPES[dtype], len(values)
-    out = staged_rows.Row("out", 2, count)
+    out = staged_rows.SharedRow("out", 2, count)
     frame = straight.KernelLayout(
-        rows=[staged_rows.Row("x", 2, rows.shape[1])], staged=False, fields=[],
-        result=straight.Result(straight.DIRECT, out), messages=0, warps=1, block=32)  # fmt: skip
+        rows=[staged_rows.SharedRow("x", 2, rows.shape[1])], staged=False, fields=[],
+        result=straight.ResultLayout(straight.DIRECT, out), messages=0, warps=1, block=32)  # fmt: skip
     emitter = Emitter(dtype, lambda array, entry: f"{array}_row[{entry}]",
                       lambda array, entry, value: f"if (mine) result_row[{entry}] = {value};",
                       lambda array, index: index[0], fuses=fuses)  # fmt: skip
@@ -249,7 +249,7 @@ def test_reciprocal_and_root(dtype, device):
 
 
 def test_a_warp_waits_for_a_row_where_it_first_uses_it():
-    rows = [staged_rows.Row(name, 2, 18) for name in ("q", "qd", "tau")]
+    rows = [staged_rows.SharedRow(name, 2, 18) for name in ("q", "qd", "tau")]
     statements = ["a = 1;", "b = q_row[3];", "if (b) {", "if (a) {", "b = tau_row[0] + qd_row[1];", "}", "}", "c = 2;"]
     found = staged_rows.wait_where_used("\n".join(statements), rows).split("\n")
     waits = {line: found[at + 1] for at, line in enumerate(found) if "wait_group" in line}
@@ -294,5 +294,5 @@ def test_a_product_begins_with_the_other_summand_of_its_sum(device):
 def test_pointers_into_rows_have_names_of_their_own():
     """Steps of other integrators read q beside q_from."""
     for row in ("q", "qd"):
-        copy = staged_rows._copy_in(staged_rows.Row(row, 2, 7), 0, "float", False)
+        copy = staged_rows._copy_in(staged_rows.SharedRow(row, 2, 7), 0, "float", False)
         assert not re.search(rf"\b{row}_(from|to)\b", copy.declared + copy.one + copy.several)

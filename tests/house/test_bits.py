@@ -175,6 +175,6 @@ def test_formulas_do_not_depend_on_the_number_of_worlds(granularity, dtype):
     for links in (7, 40):
         scene = shapes.random_tree(links)
         plans = [plan.choose(scene, worlds, MEASURED, dtype, granularity) for worlds in (1, 1000, 65536, 1 << 20)]
-        assert len({one.apart for one in plans}) == 1
-        found.add(plans[0].apart)
+        assert len({one.bias_first for one in plans}) == 1
+        found.add(plans[0].bias_first)
     assert True in found

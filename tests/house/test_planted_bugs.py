@@ -10,14 +10,12 @@ from support.mutants import mutant
 from support.routines import ROUTINES
 from warp_spo.execution.node import functions as node_functions
 from warp_spo.execution.node import sweeps as levels
-from warp_spo.execution.segment import shared_code as shared_text
-from warp_spo.execution.segment import warp_specialized as teams
+from warp_spo.execution.segment import shared_code, warp_specialized
 from warp_spo.graph import blocks
 from warp_spo.kernels import straight_line as straight
 from warp_spo.recursions import articulated, articulated_sweeps, newton_euler
 from warp_spo.recursions import mass_matrix_inverse as inverse
-from warp_spo.recursions.model import links, messages
-from warp_spo.recursions.model import segments as pieces
+from warp_spo.recursions.model import links, messages, segments
 from warp_spo.trace import scalars as graph
 from warp_spo.trace import spatial
 
@@ -179,13 +177,14 @@ def team_error(monkeypatch, operation="forward_dynamics", name="star"):
 
 
 TEAM_MUTANTS = {
-    "a slot too near": (messages, "slots", "at += size(letter, piece)", "at += size(letter, piece) - 1"),
-    "no barrier before the trunk": (pieces.Pieces, "_hand_over",
-                                    "child.inward + (child.warp != piece.warp)", "child.inward"),
-    "no barrier after the trunk": (pieces.Pieces, "__init__",
-                                   "piece.parent.outward + (piece.warp != piece.parent.warp)", "piece.parent.outward"),
-    "another limb's entries": (shared_text.SharedText, "_distances", "who * {step}", "who * {step + 1}"),
-    "another limb's constants": (shared_text.SharedText, "merge", "zip(*constants.columns, strict=True)",
+    "a slot too near": (messages, "offsets", "at += size(letter, segment)", "at += size(letter, segment) - 1"),
+    "no barrier before the trunk": (segments.Segments, "_hand_over",
+                                    "child.inward + (child.warp != segment.warp)", "child.inward"),
+    "no barrier after the trunk": (segments.Segments, "__init__",
+                                   "segment.parent.outward + (segment.warp != segment.parent.warp)",
+                                   "segment.parent.outward"),
+    "another limb's entries": (shared_code.SharedCode, "_distances", "who * {step}", "who * {step + 1}"),
+    "another limb's constants": (shared_code.SharedCode, "merge", "zip(*constants.columns, strict=True)",
                                  "[*zip(*constants.columns, strict=True)][::-1]"),
 }  # fmt: skip
 
@@ -208,11 +207,16 @@ def test_a_wrong_team(bug, monkeypatch):
 INVERSE_MUTANTS = {
     "another column": (inverse.Inverse, "_meet", "sent[length * at : length * at + common]", "sent[:common]"),
     "what lies further in": (inverse.Inverse, "_come_back", "[dot(row, force) for row in N]", "[0.0 for row in N]"),
-    "parted too early": (pieces.Piece, "fork", "(other, *other.ancestors)", "reversed((other, *other.ancestors))"),
-    "no barrier before they meet": (teams.Team, "cuda", "BARRIER, self._rounds(alike)", "self._rounds(alike)"),
-    "another limb's turns": (shared_text.SharedText, "take_turns", "initial=0", "initial=1"),
+    "parted too early": (
+        segments.Segment,
+        "common_ancestor",
+        "(other, *other.ancestors)",
+        "reversed((other, *other.ancestors))",
+    ),
+    "no barrier before they meet": (warp_specialized.WarpSpecializedKernel, "cuda", "BARRIER,\n", ""),
+    "another limb's turns": (shared_code.SharedCode, "take_turns", "initial=0", "initial=1"),
     "a turn too few": (
-        shared_text.SharedText,
+        shared_code.SharedCode,
         "take_turns",
         "counts.values())}; ++each",
         "[n - 1 for n in counts.values()])}; ++each",
@@ -223,7 +227,7 @@ INVERSE_MUTANTS = {
 @pytest.mark.parametrize("bug", INVERSE_MUTANTS)
 def test_a_wrong_inverse(bug, monkeypatch):
     """Branches that meet where limbs part, and part again, in loops."""
-    monkeypatch.setattr(shared_text, "CACHED", 0)
+    monkeypatch.setattr(shared_code, "CACHED", 0)
     assert team_error(monkeypatch, "mass_matrix_inverse", "dancer") <= TOLERANCE["float64"]
     symbolic.plant(monkeypatch, *INVERSE_MUTANTS[bug])
     try:

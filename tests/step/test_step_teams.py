@@ -12,12 +12,12 @@ from support.granularity_scenes import MANY, hand
 from support.routines import ROUTINES
 from support.step_scenes import FORCES, TOLERANCE, H, furnished, states
 from warp_spo.execution import plan
-from warp_spo.execution.segment import warp_specialized as teams
+from warp_spo.execution.segment import warp_specialized
 from warp_spo.kernels import pass_loops
 from warp_spo.kernels import straight_line as straight
 from warp_spo.kernels.substeps import repeat_on_cuda
 from warp_spo.recursions.step import step as steps
-from warp_spo.recursions.step.step import SHORT, Step, by_pieces
+from warp_spo.recursions.step.step import SHORT, Step, by_segments
 
 WORLDS = 4
 SCENES = {
@@ -122,7 +122,7 @@ def test_what_stays_a_thread_a_world(device):
     a = states(short, 2, "float32")
     step(dyn, {name: array[:1] for name, array in a.items()})
     assert "tree" in dyn.programs.described()[0]
-    assert by_pieces(scene_of("fork")) and not by_pieces(short)
+    assert by_segments(scene_of("fork")) and not by_segments(short)
 
 
 # -- warps -------------------------------------------------------------------------------------------------------------
@@ -298,7 +298,8 @@ BUGS = {
         pass_loops, "repeat_team_passes", "going = __syncthreads_or(missed_row[0] > 0)", "going = missed_row[0] > -1"),
     "a guess that stays": (Step, "_stores_of_pass", "after = gain\n", "after = 0.0 * gain\n"),
     "a limb that is not asked": (pass_loops, "repeat_team_passes", "for warp in range(warps)", "for warp in range(1)"),
-    "a word before it is said": (teams.Team, "_in_passes", "if last and any(text_of_ranks)", "if False"),
+    "a word before it is said": (warp_specialized.WarpSpecializedKernel, "_in_passes",
+        "if last and any(text_of_ranks)", "if False"),
     "a word unheard": (Step, "_words", "select(less(worst, word), word, worst)", "word"),
 }  # fmt: skip
 NEEDS = {"flags in one place": "roots", "a limb that is not asked": "hand"}

@@ -64,9 +64,9 @@ def step(scene, a, h, passes):
     trace, worlds = trace_of(scene, (*arguments, "dt", "passes")), len(a["q"])
     stores = contact.step(trace)
     known = a | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
-    known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(trace.begin)))}
+    known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(trace.prologue)))}
     known[GROUND] = cells_of(known)
-    answers = [store(trace.begin, known, known)]
+    answers = [store(trace.prologue, known, known)]
     looped = [item for item in stores if item.array in (GAIN, SECANT)]
     for number in range(passes):
         known["pass"] = np.full((worlds, 1), float(number))
@@ -87,7 +87,7 @@ def gradient(scene, a, h, passes, cotangents, wrt, ran=None):
     names = (*arguments, "dt", "passes", "number")
     laws = one.count_laws(trace_of(scene, names))
     count = one.count_variables(Links(scene, VALUES), laws)
-    weighed = SIZES["P"] * len(one.weighed_pieces(trace_of(scene, names)))
+    weighed = SIZES["P"] * len(one.weighed_segments(trace_of(scene, names)))
     back_names = (*names, "qdd", "solved", "q_cotangent", "qd_cotangent")
     kernels = {
         "contact_pass": one.contact_pass(trace_of(scene, names), laws),

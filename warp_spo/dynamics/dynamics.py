@@ -236,9 +236,9 @@ class Dynamics:
         self.dtype: type[Any] = parse_dtype(dtype, "Dynamics")
         self.variable = _variable_names(variable)
         check_loops(scene, loops)
-        varies = any(name in self.variable or scene.values[name].shape[0] > 1 for name in RIGID_VALUES)
+        variable_inertia = any(name in self.variable or scene.values[name].shape[0] > 1 for name in RIGID_VALUES)
         device, precision = read_facts(self.device), self.dtype.__name__
-        self.plan = plans.choose(scene, self.worlds, device, precision, granularity, varies, recursion)
+        self.plan = plans.choose(scene, self.worlds, device, precision, granularity, variable_inertia, recursion)
         self.granularity = self.plan.granularity
         self.recursions = Sweeps(scene, self.plan, self.device, self.dtype, self.variable)
         self.programs = Programs(self.recursions, self.plan)

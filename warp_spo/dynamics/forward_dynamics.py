@@ -67,7 +67,7 @@ FORWARD_DYNAMICS = Operation(
         nodes.forward_dynamics,
         letters="Pza",
         collects=True,
-        aside=168,
+        registers_when_spilling=168,
         bias_first=Routine(
             "forward_dynamics_apart",
             recursion.forward_dynamics_bias_first,

@@ -39,14 +39,14 @@ if TYPE_CHECKING:
     from .gradients import Gradients
 
 WEIGHT_FLOOR = 1e-2  # gravity does not act on some hinges: compare with at least this share of the weight, at 1 m
-BY_PIECES = ("q", "tangent", "qd", "qdd", "tau")  # arguments whose gradient a limb computes by itself
+BY_SEGMENTS = ("q", "tangent", "qd", "qdd", "tau")  # arguments whose gradient a limb computes by itself
 DQ = Argument("dq", "world, dof", optional=True, direction=True)
 FORCES = (Result("tau", "world, independent dof"),)
 
 
 def divides_backwards(scene: Any, inputs: Any, wrt: tuple[str, ...] = (), **_: Any) -> bool:
     """Return whether limbs can share a Newton-Euler recursion in reverse."""
-    return "body_f" not in inputs and set(wrt) <= set(BY_PIECES)
+    return "body_f" not in inputs and set(wrt) <= set(BY_SEGMENTS)
 
 
 def _title(inputs: tuple[str, ...], *_: Any) -> str:

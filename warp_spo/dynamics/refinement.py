@@ -34,7 +34,7 @@ class Refinement:
         self.steps = steps
         other = "float64" if dyn.dtype is wp.float32 else "float32"
         granularity = dyn.granularity if dyn.plan.forced else None
-        recursion = "scan" if dyn.plan.forced and dyn.plan.stretch else None
+        recursion = "scan" if dyn.plan.forced and dyn.plan.block_length else None
         own = dyn.scene, dyn.worlds, dyn.device, other, dyn.variable, granularity, "cut"
         twin = type(dyn)(*own, recursion=recursion)
         twin.recursions.parameters.share(dyn.recursions.parameters)

@@ -24,7 +24,7 @@ THREADS = 64  # of a block: doubling has few threads, and more blocks use more o
 class Round:
     """E^(2^r): the tables of its blocks on the device, the nodes that have one, and the scalars of all blocks."""
 
-    tables: kernels.Round
+    tables: kernels.DoublingTables
     nodes: wp.array
     scalars: int
     widest: int
@@ -106,7 +106,7 @@ def _rounds(tree: Tree, dims: Sequence[int], offsets: Any, device: wp.Device) ->
         if found:
             offset = np.zeros(len(size), np.int64)
             offset[nodes] = np.cumsum([0, *scalars[:-1]])
-        tables: Any = kernels.Round()
+        tables: Any = kernels.DoublingTables()
         lists = {
             "ancestor": ancestor,
             "offset": offset,

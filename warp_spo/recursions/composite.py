@@ -28,17 +28,17 @@ def entries(
     The forces of a group's columns on its parent are added up in ``shared``, and go on from its last link.
     """
     found = own_entries(link, places[id(link)], body)
-    for (i, j), x in link.coupled.items():
+    for (i, j), x in link.coupling_inertia.items():
         found[link.dofs[i], link.dofs[j]] = found[link.dofs[i], link.dofs[j]] + x
     for column, H in zip(link.dofs, columns(link, places[id(link)]), strict=True):
         n, f = body.apply(Vector(H[:3]), Vector(H[3:]))
         over = link
-        if link.group is not None and link.parent is not None:
+        if link.shared_dofs is not None and link.parent is not None:
             n, f = places[id(link)].pose.force_to_parent(n, f)
             if column in shared:
                 n, f = shared[column][0] + n, shared[column][1] + f
             shared[column] = n, f
-            if not link.closes:
+            if not link.is_last:
                 continue
             over = link.parent
             found |= _rows(over, places, column, n, f)

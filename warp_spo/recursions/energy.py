@@ -25,7 +25,7 @@ def kinetic_energy(trace: Trace) -> list[Store]:
             twice = twice + (dot(w, n) + dot(v, f))
         for dof, armature in zip(link.dofs, link.armature, strict=True):
             twice = twice + armature * (qd(dof) * qd(dof))
-        for (i, j), x in link.coupled.items():
+        for (i, j), x in link.coupling_inertia.items():
             twice = twice + (2.0 * x) * (qd(link.dofs[i]) * qd(link.dofs[j]))
     return [Store("out", (), 0.5 * twice)]
 
@@ -54,9 +54,9 @@ def potential_energy(trace: Trace) -> list[Store]:
 def moment_of_ground(trace: Trace) -> Vector:
     """Return the sum of m c of the bodies that no hinge can move, in the inertial frame."""
     moment: Vector = ZERO
-    for body, seat in trace.links.seats.items():
-        if seat.link is None:
-            rigid, axes, origin = trace.links.nodes[body].rigid, seat.matrix, seat.offset
+    for body, placement in trace.links.placements.items():
+        if placement.link is None:
+            rigid, axes, origin = trace.links.nodes[body].rigid, placement.matrix, placement.offset
             if body in trace.links.flexible:  # its other pieces are links
                 _, axes, origin, _, rigid = trace.links.flexible[body]
             moment = moment + origin * rigid.mass + axes @ rigid.moment

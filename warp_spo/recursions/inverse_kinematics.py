@@ -43,7 +43,7 @@ def moving_links(trace: Trace, frames: tuple) -> list[Link]:
     """Return the links that move a frame, parents first."""
     found: set[int] = set()
     for body, _ in frames:
-        link = trace.links.seats[body].link
+        link = trace.links.placements[body].link
         while link is not None and id(link) not in found:
             found.add(id(link))
             link = link.parent
@@ -143,12 +143,12 @@ def _errors(
     rows: list[dict[int, Value]] = []
     worst: Value = 0.0
     for index, (body, pose) in enumerate(frames):
-        seat, (R, p) = trace.links.seats[body], trace.links.nodes[body].anchor
-        link = seat.link
+        placement, (R, p) = trace.links.placements[body], trace.links.nodes[body].anchor
+        link = placement.link
         trace.graph.step = f"frame {index}|e"
         wanted = [target(7 * index + c) for c in range(7)]
-        within = seat.matrix @ R.T
-        arm, within = seat.offset + within @ (Vector(pose[:3]) - p), within @ quaternion_rotation(*pose[3:])
+        within = placement.matrix @ R.T
+        arm, within = placement.offset + within @ (Vector(pose[:3]) - p), within @ quaternion_rotation(*pose[3:])
         axes, key = (IDENTITY, None) if link is None else (trace.axes[id(link)], id(link))
         position = Vector(wanted[:3]) - (origins[key] + axes @ arm)
         relative = quaternion_rotation(*wanted[3:]) @ (axes @ within).T

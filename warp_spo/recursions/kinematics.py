@@ -60,14 +60,14 @@ def frame_on_link(trace: Trace, body: int, origin: tuple) -> tuple[Link | None, 
     """Return the link that carries a frame of a body, and the frame's origin in the link's frame."""
     if (body, tuple(origin)) in trace.links.ports:
         return trace.links.ports[body, tuple(origin)].link, ZERO
-    seat = trace.links.seats[body]
-    return seat.link, seat.offset + arm_on_link(trace, body, origin)
+    placement = trace.links.placements[body]
+    return placement.link, placement.offset + arm_on_link(trace, body, origin)
 
 
 def arm_on_link(trace: Trace, body: int, origin: tuple) -> Vector:
     """Return the way from a body's node frame to the origin of a frame of the body, in the axes of its link."""
     R, p = trace.links.nodes[body].anchor
-    return trace.links.seats[body].matrix @ (R.T @ (Vector(origin) - p))
+    return trace.links.placements[body].matrix @ (R.T @ (Vector(origin) - p))
 
 
 def jacobian(trace: Trace, frames: tuple) -> list[Store]:
@@ -115,13 +115,13 @@ def quaternions_in_links(links: Links) -> dict[int, Quaternion]:
         rest = Vector(map(constant_of, link.hinge.quaternion_at_rest(link)))
         by_links[id(link)] = multiplied(by_links[over], rest)
     found = {}
-    for body, seat in links.seats.items():  # parents first; all at neutral coordinates
+    for body, placement in links.placements.items():  # parents first; all at neutral coordinates
         hinge = scene.hinge_of[body]
         outer, inner = (Vector(scene.values[name][0, hinge, 3:].tolist()) for name in ("joint_X_p", "joint_X_c"))
         back = Vector((-inner[0], -inner[1], -inner[2], inner[3]))
         by_anchors[body] = multiplied(by_anchors[scene.tree.parent[body]], multiplied(outer, back))
-        own = constant_quaternion(seat.matrix @ links.nodes[body].anchor[0].T)
-        carried = multiplied(by_links[None if seat.link is None else id(seat.link)], own)
+        own = constant_quaternion(placement.matrix @ links.nodes[body].anchor[0].T)
+        carried = multiplied(by_links[None if placement.link is None else id(placement.link)], own)
         found[body] = own * (-1.0 if dot(carried, by_anchors[body]) < 0.0 else 1.0)
     return found
 
@@ -129,14 +129,14 @@ def quaternions_in_links(links: Links) -> dict[int, Quaternion]:
 def body_poses(trace: Trace) -> list[Store]:
     """out [body, 7] = position, quaternion xyzw"""
     (at, turns), within = link_poses(trace), quaternions_in_links(trace.links)
-    stores, numbers = [], trace.links.numbers
+    stores, constants = [], trace.links.shared_constants
     for number, body in enumerate(trace.own_bodies):
-        seat, (R, p) = trace.links.seats[body], trace.links.nodes[body].anchor
-        key = None if seat.link is None else id(seat.link)
-        axes = seat.matrix @ R.T
-        origin, turn = seat.offset - axes @ p, within[body]
-        if numbers is not None:
-            origin, turn = (Vector(numbers.of_body(number, *each)) for each in (("origin", origin), ("turn", turn)))
+        placement, (R, p) = trace.links.placements[body], trace.links.nodes[body].anchor
+        key = None if placement.link is None else id(placement.link)
+        axes = placement.matrix @ R.T
+        origin, turn = placement.offset - axes @ p, within[body]
+        if constants is not None:
+            origin, turn = (Vector(constants.of_body(number, *each)) for each in (("origin", origin), ("turn", turn)))
         position = at[key] + turned(turns[key], origin)
         pose = (*position, *multiplied(turns[key], turn))
         stores += [Store("out", (body, c), value) for c, value in enumerate(pose)]

@@ -27,7 +27,7 @@ from ...recursions.derivatives.contact_pass import (
     contact_pass,
     count_laws,
     count_variables,
-    weighed_pieces,
+    weighed_segments,
 )
 from ...recursions.model.messages import SIZES
 from ...recursions.model.tracing import Trace
@@ -125,12 +125,12 @@ def _launch(dyn: Dynamics, asked: dict[str, wp.array], count: int, **given: Any)
 
 
 def _laws(dyn: Dynamics, inputs: tuple[str, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return how many variables the laws of each link have, and which pieces carry what these laws feel.
+    """Return how many variables the laws of each link have, and which segments carry what these laws feel.
 
     Both depend on what is given besides the state.
     """
     known = dyn._gradients.pass_laws
     if inputs not in known:
         traces = (Trace(dyn.programs.links.with_tables(), dyn.dtype.__name__, inputs) for _ in range(2))
-        known[inputs] = count_laws(next(traces)), weighed_pieces(next(traces))
+        known[inputs] = count_laws(next(traces)), weighed_segments(next(traces))
     return known[inputs]

@@ -36,7 +36,7 @@ RK4 = ((0.0, 1.0 / 6.0), (0.5, 1.0 / 3.0), (0.5, 1.0 / 3.0), (1.0, 1.0 / 6.0))
 
 
 def _divides(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
-    return recursion.by_pieces(scene)
+    return recursion.by_segments(scene)
 
 
 def _limbs_couple(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
@@ -44,7 +44,9 @@ def _limbs_couple(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
 
 
 STEP = Routine("step", recursion.step, letters="PzaSX", divides=_divides, passes=True, wide=True)
-BODIES_BY_WALKS = Routine("body_states", kinematics.body_states, alone=True, passes=True, wide=True, walks=True)
+BODIES_BY_KINEMATICS = Routine(
+    "body_states", kinematics.body_states, alone=True, passes=True, wide=True, body_kinematics=True
+)
 PAIRED_STEP = Routine(
     "paired_step", pair_pieces.step, letters="PzafSE", divides=_limbs_couple, passes=True, counted=True, wide=True,
     couples=True,
@@ -136,15 +138,15 @@ def arrays_of_bodies(dyn: Dynamics, states: dict[str, Any]) -> tuple[wp.array, w
 def write_bodies(dyn: Dynamics, q: wp.array, qd: wp.array, bodies: tuple[wp.array, wp.array]) -> None:
     """Launch the poses and velocities of the bodies at a state."""
     more = {"velocities_out": bodies[1]}
-    if _walks(dyn) and dyn._engine.has_program(BODIES_BY_WALKS, bodies[0], more, q=q, qd=qd):
-        dyn._engine.launch_routine(BODIES_BY_WALKS, bodies[0], more, q=q, qd=qd)
+    if _walks(dyn) and dyn._engine.has_program(BODIES_BY_KINEMATICS, bodies[0], more, q=q, qd=qd):
+        dyn._engine.launch_routine(BODIES_BY_KINEMATICS, bodies[0], more, q=q, qd=qd)
     else:
         dyn._engine.launch(BODY_STATES, bodies[0], more, q=q, qd=qd)
 
 
 def _walks(dyn: Dynamics) -> bool:
     """Whether a kernel of its own walks to the bodies after a step: whatever the number of worlds, for equal bits."""
-    return dyn.plan.of(STEP) == "segment" and dyn.programs.builder.walks
+    return dyn.plan.of(STEP) == "segment" and dyn.programs.builder.supports_body_kinematics
 
 
 def several_launches(dyn: Dynamics, integrator: str, acts: bool, delays: bool, passes: int | None = None) -> str:

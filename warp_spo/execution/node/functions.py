@@ -21,7 +21,7 @@ from ...recursions import articulated, kinematics, motion, newton_euler
 from ...recursions.articulated import Pivot
 from ...recursions.model.links import Placed
 from ...recursions.model.tracing import EPSILON
-from ...recursions.motion import STILL, Motion
+from ...recursions.motion import STILL, VelocityTerms
 from ...trace.emission import Emitter, Store, render
 from ...trace.scalars import Graph, Value, reciprocal
 from ...trace.spatial import Articulated, Matrix, Pose, Rigid, Vector, magnitude
@@ -47,7 +47,7 @@ RIGID, INERTIA = ArgumentKind(10, Rigid.unpacked), ArgumentKind(21, Articulated.
 MOVING = ArgumentKind(6, lambda x: STILL._replace(spin=Vector(x[:3]), whirl=motion.whirl(x)))
 
 
-def _node_acceleration(pose: Pose, above: Motion, alpha: tuple, own: tuple, bias: Vector) -> Vector:
+def _node_acceleration(pose: Pose, above: VelocityTerms, alpha: tuple, own: tuple, bias: Vector) -> Vector:
     move = motion.compose_motions(pose, above, *own)
     w, v = motion.carry_acceleration(Placed(pose, None), move, alpha)
     return Vector((*(w + move.bias_w), *(v + move.bias_v))) + bias

@@ -54,9 +54,9 @@ class Sweeps:
         self._frames: dict[tuple, tuple[wp.array, wp.array]] = {}
         self._hinge_kernels: dict[bool, wp.Kernel | None] = {}  # with velocities or not
         self.scan: Scan | None = None
-        self.use_stretch(plan.stretch)
+        self.use_block_length(plan.block_length)
 
-    def use_stretch(self, length: int) -> None:
+    def use_block_length(self, length: int) -> None:
         """Let scans with so many nodes for a thread do the work of sweeps from now on; 0: let sweeps do it."""
         self.scan = Scan(self, length) if length else None
 

@@ -121,8 +121,8 @@ class Node:
             return
         P, z = Articulated.unpacked([next(take) for _ in range(21)]), Vector(take)
         if not tops:
-            add(trace.dampers, id(base), P)
-            add(trace.pushes, id(base), -z)
+            add(trace.contact_inertia, id(base), P)
+            add(trace.contact_force, id(base), -z)
         for link in tops:
             first = link is tops[0]
             inner[id(link)], forces[id(link)] = (P, z) if first else (NO_INERTIA, NO_FORCE)
@@ -143,7 +143,7 @@ class Node:
             P = NO_INERTIA if link.inertia is None else link.inertia.articulated
             for child in link.children:
                 P = P if id(child) in mine else P + inner[id(child)]
-            P = P + trace.dampers[id(link)] if id(link) in trace.dampers else P
+            P = P + trace.contact_inertia[id(link)] if id(link) in trace.contact_inertia else P
             P, z = P + whole.get(id(link), NO_INERTIA), own[id(link)] + push.get(id(link), NO_FORCE)
             (pose, H), right = self._hinge(link), [tau(dof) for dof in link.dofs]
             if id(link) in self.plan.carried:
@@ -151,7 +151,7 @@ class Node:
                 f, n = (link.hinge.in_link_axes(place, right[part : part + 3]) for part in (0, 3))
                 z, right = force_to_parent(turn, z - Vector((*n, *f))), [0.0] * 6
                 P = turn.articulated_to_parent(P)
-            stiffened, over = trace.stiffened(link), self.plan.over[id(link)]
+            stiffened, over = trace.with_step_armature(link), self.plan.over[id(link)]
             whole[key(over)] = whole.get(key(over), NO_INERTIA) + pose.articulated_to_parent(P)
             push[key(over)] = push.get(key(over), NO_FORCE) + force_to_parent(pose, z)
             for i, column in enumerate(H):
@@ -161,7 +161,7 @@ class Node:
                 D[at, at] = D[at, at] + stiffened.armature[i]
                 eps[at] = right[i] - dot(column, z)
                 U[at] = self._carry(link, force, at, D, number)
-            for (i, j), x in link.coupled.items():
+            for (i, j), x in link.coupling_inertia.items():
                 first, last = sorted((number[id(link), i], number[id(link), j]))
                 D[last, first] = D[last, first] + x
         for tie in self.ties:
@@ -270,13 +270,13 @@ def reduce(trace: Trace, plan: Plan, nodes: dict[int, Node], tau: Callable[[int]
     own: dict[int, Vector] = {}
     for link in trace.links.links:
         trace.place(link)
-        trace.ahead += trace.places[id(link)].pose.turn or ()
+        trace.pass_invariants += trace.places[id(link)].pose.turn or ()
     for link in reversed(plan.order):
         at, place = id(link), trace.places[id(link)]
         eliminate(trace, link, done, inner)
         trace.label(link, "z")
         mine = {id(one) for one in plan.of[at].links} if at in plan.of else set()
-        z = -trace.pushes[at] if at in trace.pushes else NO_FORCE
+        z = -trace.contact_force[at] if at in trace.contact_force else NO_FORCE
         own[at] = z
         for child in link.children:
             own[at] = own[at] if id(child) in mine else own[at] + forces[id(child)]

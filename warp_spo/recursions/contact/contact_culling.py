@@ -86,7 +86,7 @@ def gather(
 ) -> dict[int, Crowd]:
     """Return the crowds by id of the link; none where code skips points one by one, as on a CPU those of walls.
 
-    A GPU skips them where limbs share the work, and where aggregates couple pairs of bodies. With a thread a world
+    A GPU skips them where segments share the work, and where aggregates couple pairs of bodies. With a thread a world
     otherwise, the one body with so many points is often the one on the ground, and branches cost a few per cent.
 
     Args:
@@ -97,7 +97,7 @@ def gather(
         if point.link is not None:
             on.setdefault(id(point.link), []).append(at)
     found: dict[int, Crowd] = {}
-    op = "branch" if trace.piece is None else "fork"
+    op = "branch" if trace.segment is None else "fork"
     for key, places in on.items():
         some = [points[at] for at in places]
         if len(some) >= CROWD and all(point.near is None for point in some):

@@ -19,9 +19,9 @@ from ...trace.scalars import Value, sqrt
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, total
 from ..articulated_sweeps import NO_FORCE, pivots, propagate_inward, weighted_products
 from ..kinematics import carried_velocity, frame_on_link, velocity
-from ..model import effective_mass as neutral
+from ..model import effective_mass
 from ..model.links import Link, Links
-from ..model.scene_cache import remembered
+from ..model.scene_cache import cached_by_scene
 from ..motion import hinge_motion
 from ..operational import respond, unit_wrenches
 from . import step as ground
@@ -56,7 +56,7 @@ class Members(NamedTuple):
 def members(links: Links) -> Members:
     """Return the bodies of the pairs of a scene."""
     pairs = [(pair.body, pair.other) for pair in links.scene.contact_pairs]
-    moving = {body for body, seat in links.seats.items() if seat.link is not None}
+    moving = {body for body, seat in links.placements.items() if seat.link is not None}
     bodies = sorted({body for pair in pairs for body in pair} & moving)
     number = {body: i for i, body in enumerate(bodies)}
     return Members(tuple(bodies), tuple((number.get(i, -1), number.get(j, -1)) for i, j in pairs))
@@ -67,7 +67,7 @@ def blocks(links: Links) -> tuple[tuple[int, ...], ...]:
 
     Two bodies move each other if they have a link with dofs in common.
     """
-    ways = [with_ancestors([links.seats[body].link]) for body in members(links).bodies]
+    ways = [with_ancestors([links.placements[body].link]) for body in members(links).bodies]
     found, count = [[-1] * len(ways) for _ in ways], 0
     for i, way in enumerate(ways):
         for j in range(i, len(ways)):
@@ -132,7 +132,7 @@ def places_of(trace: Trace, own: Collection[int]) -> list[tuple[int, Value]]:
     """
     links, identity = trace.links, np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     _, bodies, shapes = solids_of(links)
-    seats = {body: links.seat(body, identity) for body in bodies if body in own}
+    seats = {body: links.placement(body, identity) for body in bodies if body in own}
     needed = with_ancestors([seat.link for seat in seats.values()])
     place_axes_of(trace, [seat.link for seat in seats.values()])
     origins: dict[int | None, Vector] = {None: ZERO}
@@ -150,7 +150,10 @@ def places_of(trace: Trace, own: Collection[int]) -> list[tuple[int, Value]]:
             found += enumerate(origins[key] + axes[key] @ seats[body].offset, start=3 * number)
     for number, (body, pose) in enumerate(shapes):
         if body in own:
-            seat, key = links.seat(body, np.array(pose)), None if seats[body].link is None else id(seats[body].link)
+            seat, key = (
+                links.placement(body, np.array(pose)),
+                None if seats[body].link is None else id(seats[body].link),
+            )
             offset, turn = axes[key] @ (seat.offset - seats[body].offset), axes[key] @ seat.matrix
             found += enumerate([*offset, *(x for row in turn for x in row)], start=3 * len(bodies) + 12 * number)
     return found
@@ -180,7 +183,7 @@ class PairedStep(ground.ContactStep):
         self.first: list[Store] = []
         self.response: list[Store] = []
         found = super().stores(qdd, status)
-        self.trace.begin = [*self.trace.begin, *self.first]
+        self.trace.prologue = [*self.trace.prologue, *self.first]
         return self.response + found + [item for name in self.reports for item in self._report_stores(name)]
 
     def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, tuple[Vector, Vector]]) -> dict[int, Value]:
@@ -226,8 +229,8 @@ class PairedStep(ground.ContactStep):
             (w, v), R = before[id(link)], self.trace.axes[id(link)]
             twist = (*velocity(R, w, v, arm), *(R @ w))
             self.first += [Store(START, (6 * number + c,), value) for c, value in enumerate(twist)]
-        self.trace.ahead += [value for key, pair in before.items() if key for part in pair for value in part]
-        self.trace.ahead += [value for axes in self.trace.axes.values() for row in axes for value in row]
+        self.trace.pass_invariants += [value for key, pair in before.items() if key for part in pair for value in part]
+        self.trace.pass_invariants += [value for axes in self.trace.axes.values() for row in axes for value in row]
 
     def _responses(self, done: dict, frames: tuple) -> list[Store]:
         """Return the stores of the blocks J A0^-1 J*."""
@@ -258,7 +261,7 @@ class PairedStep(ground.ContactStep):
         return stores
 
 
-@remembered
+@cached_by_scene
 def inverse_weights(scene: Scene) -> list[float]:
     """Return SLIP times the inverse weight of each pair [1/kg]: both bodies', means over their shapes, neutral."""
     sides = [(body, shape) for p in scene.contact_pairs
@@ -266,5 +269,5 @@ def inverse_weights(scene: Scene) -> list[float]:
     points = [(body, tuple(point)) for body, shape in sides for point in shape.samples.tolist()]
     weights, of_bodies = np.zeros(len(points)), [body >= 0 for body, _ in points]  # what stands still has none
     frames = tuple(frame for frame in points if frame[0] >= 0)
-    weights[of_bodies] = SLIP / 3.0 * neutral.inverse_weights(scene, frames)
+    weights[of_bodies] = SLIP / 3.0 * effective_mass.inverse_weights(scene, frames)
     return weights.reshape(len(scene.contact_pairs), 2, -1).mean(axis=2).sum(axis=1).tolist()

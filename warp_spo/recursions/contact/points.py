@@ -9,12 +9,13 @@ link.
 
 A point's path within the step is a parabola: at rates that stay as they are it accelerates by n* J' qd = ``bend`` along
 the normal, so that after the step it is h n* v + h^2 bend / 2 further out, and leaves the ground by h bend faster. The
-spring and the damper see that. Without it a point of a limb that turns fast ends up to h^2 bend / 2 deeper than the
+spring and the damper see that. Without it a point of a segment that turns fast ends up to h^2 bend / 2 deeper than the
 spring has worked for, and energy rises. Where velocity terms are kicks, all is half way, where J* is the mean along the
 path: the point was half a step back before the step, along that path, and n* J v is its mean speed.
 
-A piece works on the points of its links. Those of the link on which other pieces begin are shared among these in equal
-numbers, and only the rest stays: they know that link's motion, and their messages to it carry what the points add.
+A segment works on the points of its links. Those of the link on which other segments begin are shared among these in
+equal numbers, and only the rest stays: they know that link's motion, and their messages to it carry what the points
+add.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ from ...scene.scene import Scene
 from ...trace.scalars import Value, absolute, branch, is_constant, less, lost, reciprocal, select
 from ...trace.spatial import IDENTITY, ZERO, Vector, cross, dot, total
 from ..kinematics import arm_on_link, carried_velocity, frame_on_link, zero
-from ..model import effective_mass as neutral
+from ..model import effective_mass
 from ..model.links import Link, Links
-from ..model.scene_cache import remembered
-from ..model.segments import Piece, Pieces
+from ..model.scene_cache import cached_by_scene
+from ..model.segments import Segment, Segments
 from ..model.tracing import Trace
-from ..motion import Motion, hinge_motion, link_motion
+from ..motion import VelocityTerms, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
 from ..step.joint_laws import is_number
 from .ground import Corners, Place, Surface, directions, lowest, surface_count, surfaces
@@ -43,7 +44,7 @@ from .velocity_kicks import KICK, PATH
 if TYPE_CHECKING:
     from ..step.joint_laws import Impedance
 
-ARMS = 8  # spheres of a limb up to which their arms are kept, see docs/contact_measured.md
+ARMS = 8  # spheres of a segment up to which their arms are kept, see docs/contact_measured.md
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
 
 
@@ -127,7 +128,7 @@ class Carried(NamedTuple):
     axes: list[Vector]
     origins: list[Value]
     twist: tuple[Vector, Vector]
-    motion: Motion | None
+    motion: VelocityTerms | None
     bend: tuple[Vector, Vector]
     travel: tuple[Vector, Vector]
 
@@ -163,8 +164,8 @@ def place_points(
     for number, (on, centre) in seats.items():
         point, mine = scene.contact_points[number], carried[None if on is None else id(on)]
         radius, eps, weight = point.radius, point.eps, weights[number]
-        if trace.links.numbers is not None:
-            radius, eps, weight = trace.links.numbers.of_point(number, "contact", (radius, eps, weight))
+        if trace.links.shared_constants is not None:
+            radius, eps, weight = trace.links.shared_constants.of_point(number, "contact", (radius, eps, weight))
         trace.graph.step = f"contact {number}|c"
         toward = mine.axes[:count]
         arm = centre if is_number(radius, 0.0) else centre - toward[lowest(ground)] * radius
@@ -233,56 +234,58 @@ def surface_numbers(scene: Scene, varies: bool) -> list[range]:
 
 def point_links(links: Links) -> list[Link | None]:
     """Return the links that carry the scene's contact points."""
-    return [links.seats[point.body].link for point in links.scene.contact_points]
+    return [links.placements[point.body].link for point in links.scene.contact_points]
 
 
 def own_points(trace: Trace) -> list[tuple[int, ContactPoint]]:
     """Return the contact points that a trace works on, with their numbers."""
-    return points_of(trace.links, trace.piece)
+    return points_of(trace.links, trace.segment)
 
 
 def keeps_arms(trace: Trace) -> bool:
     """Return whether passes keep the arms of points, rather than find each from the normal anew, in three operations.
 
-    Where limbs share the work they do, unless a limb has so many spheres that registers run out.
+    Where segments share the work they do, unless a segment has so many spheres that registers run out.
     """
-    pieces = [] if trace.piece is None else Pieces(trace.links).pieces
-    spheres = (sum(point.radius > 0.0 for _, point in points_of(trace.links, piece)) for piece in pieces)
+    segments = [] if trace.segment is None else Segments(trace.links).all
+    spheres = (sum(point.radius > 0.0 for _, point in points_of(trace.links, segment)) for segment in segments)
     return max(spheres, default=0) <= ARMS
 
 
-def points_of(links: Links, piece: Piece | None) -> list[tuple[int, ContactPoint]]:
-    """Return the contact points that a piece works on, or the whole tree, with their numbers."""
+def points_of(links: Links, segment: Segment | None) -> list[tuple[int, ContactPoint]]:
+    """Return the contact points that a segment works on, or the whole tree, with their numbers."""
     points = list(enumerate(links.scene.contact_points))
-    if piece is None:
+    if segment is None:
         return points
     on: dict[int | None, list[tuple[int, ContactPoint]]] = {}
     for number, point in points:
-        link = links.seats[point.body].link
+        link = links.placements[point.body].link
         on.setdefault(None if link is None else id(link), []).append((number, point))
-    found = on.get(None, []) if piece.index == 0 else []
-    for link in piece.links:
+    found = on.get(None, []) if segment.index == 0 else []
+    for link in segment.links:
         mine = on.get(id(link), [])
-        each = len(mine) // len(piece.children) if piece.children and link is piece.links[-1] else 0
-        found += mine[each * len(piece.children) :]
-    if piece.parent is not None:
-        shared, sharers = on.get(id(piece.parent.links[-1]), []), piece.parent.children
-        each, first = len(shared) // len(sharers), sharers.index(piece)
+        each = len(mine) // len(segment.children) if segment.children and link is segment.links[-1] else 0
+        found += mine[each * len(segment.children) :]
+    if segment.parent is not None:
+        shared, sharers = on.get(id(segment.parent.links[-1]), []), segment.parent.children
+        each, first = len(shared) // len(sharers), sharers.index(segment)
         found += shared[first * each : (first + 1) * each]
     return found
 
 
 def _seat(trace: Trace, number: int, body: int, place: tuple) -> tuple[Link | None, Vector]:
     """Return the link that carries a contact point, and the point in the link's frame."""
-    numbers, seat = trace.links.numbers, trace.links.seats[body]
-    if numbers is None or (body, tuple(place)) in trace.links.ports:
+    constants, placement = trace.links.shared_constants, trace.links.placements[body]
+    if constants is None or (body, tuple(place)) in trace.links.ports:
         return frame_on_link(trace, body, place)
     arm = arm_on_link(trace, body, place)
-    fixed = seat.offset + arm  # where the body's place in its link varies, only the arm is a constant
+    fixed = placement.offset + arm  # where the body's place in its link varies, only the arm is a constant
     arm = Vector(0.0 if is_constant(x) else y for x, y in zip(fixed, arm, strict=True))
-    free = seat.offset + Vector(numbers.of_point(number, "arm", arm))
-    fixed = Vector(numbers.of_point(number, "centre", fixed))
-    return seat.link, Vector(y if is_constant(o) else x for o, x, y in zip(seat.offset, free, fixed, strict=True))
+    free = placement.offset + Vector(constants.of_point(number, "arm", arm))
+    fixed = Vector(constants.of_point(number, "centre", fixed))
+    return placement.link, Vector(
+        y if is_constant(o) else x for o, x, y in zip(placement.offset, free, fixed, strict=True)
+    )
 
 
 def _places(trace: Trace, impedance: Impedance) -> Iterator[tuple[int, int, tuple]]:
@@ -326,8 +329,8 @@ def with_ancestors(links: list[Link | None]) -> set[int]:
     return found
 
 
-@remembered
+@cached_by_scene
 def inverse_weights(scene: Scene) -> list[float]:
     """Return SLIP times the mean of J Mass^-1 J* over three directions, of each point, neutral, in world 0 [1/kg]."""
     frames = tuple((point.body, point.position) for point in scene.contact_points)
-    return (SLIP / 3.0 * neutral.inverse_weights(scene, frames)).tolist()
+    return (SLIP / 3.0 * effective_mass.inverse_weights(scene, frames)).tolist()

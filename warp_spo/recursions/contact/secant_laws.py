@@ -10,7 +10,7 @@ from __future__ import annotations
 from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Graph, Value, absolute, inverse_root, less, reciprocal, select
-from ..model.scene_cache import remembered
+from ..model.scene_cache import cached_by_scene
 from ..step.joint_laws import CREEP, FRICTION, LIMIT, Law, is_number
 
 SECANT = "secant"
@@ -149,7 +149,7 @@ def largest(values: list[Value]) -> Value:
     return found
 
 
-@remembered
+@cached_by_scene
 def single_dofs(scene: Scene) -> frozenset[int]:
     """Return the dofs of the hinges that have one."""
     return frozenset(

@@ -22,7 +22,7 @@ from ..articulated_sweeps import Factors, expand, reduce
 from ..coordinates import integrate_link
 from ..kinematics import zero
 from ..model.links import Link
-from ..model.segments import Piece, Pieces
+from ..model.segments import Segment, Segments
 from ..newton_euler import inverse_dynamics
 from ..step.joint_laws import Law, add_laws
 from ..step.step import GAIN, Step
@@ -60,9 +60,9 @@ class ContactStep(Step):
     def __init__(self, trace: Trace, reports: tuple[str, ...]):
         self.kicked, before, self.kick = KICK in trace.inputs, trace.vector("qd"), trace.vector(KICK)
         if self.kicked:
-            trace.instead = {"q": trace.vector(START), "qd": lambda dof: before(dof) + self.kick(dof)}
+            trace.substitutes = {"q": trace.vector(START), "qd": lambda dof: before(dof) + self.kick(dof)}
         super().__init__(trace)
-        trace.instead.pop("q", None)  # the sweep is half way, its laws are not
+        trace.substitutes.pop("q", None)  # the sweep is half way, its laws are not
         self.reports, self.kept = reports, Kept(trace.graph)
         self.secants: dict[int, list[Secant]] = {}  # by dof
         self.crowds: dict[int, Crowd] = {}  # by id of the link
@@ -70,14 +70,14 @@ class ContactStep(Step):
         self.finished: dict[str, list[Store]] = {name: [] for name in reports}
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
-        """Return the stores of a pass, then those after the last one; ``trace.begin`` are those before the first.
+        """Return the stores of a pass, then those after the last one; ``trace.prologue`` are those before the first.
 
-        For a piece, those after the last pass are the trace's ``news``.
+        For a segment, those after the last pass are the trace's ``final_messages``.
         """
         trace, kept = self.trace, self.kept
         bias, sent_ahead = self._bias()
         points, touches, candidates = [], [], []
-        alone = trace.piece is None  # limbs side by side are for GPUs, where branches cost more than they spare
+        alone = trace.segment is None  # segments side by side are for GPUs, where branches cost more than they spare
         for raw in place_points(trace, self.impedance, self.qd, "contact_f" in self.reports, branches=alone):
             point, first = raw.settled(*self._first(raw))
             points.append(point)
@@ -85,11 +85,11 @@ class ContactStep(Step):
             candidates.append(first[1])
         self._gather(points, touches, candidates)
         arms = keeps_arms(trace)
-        trace.ahead = [*bias.values()]
-        trace.ahead += [value for point in points for value in point.state(arms)]
-        trace.ahead += [value for crowd in self.crowds.values() for value in (crowd.highest, crowd.reach)]
+        trace.pass_invariants = [*bias.values()]
+        trace.pass_invariants += [value for point in points for value in point.state(arms)]
+        trace.pass_invariants += [value for crowd in self.crowds.values() for value in (crowd.highest, crowd.reach)]
         self._press(points, touches)
-        trace.stiffened = self._with_resistance
+        trace.with_step_armature = self._with_resistance
         tau = trace.vector("tau")
         done, rates, sent = self.inward(lambda dof: tau(dof) + self.forces[dof] - bias[dof])
         rates = self.close(done, rates)
@@ -111,15 +111,17 @@ class ContactStep(Step):
         forces = self._forces(points, touches, alpha, excess)
         for number, surfaces in forces.items():
             self._report(number, surfaces)
-        trace.ahead += [item.value for item in self.finished.get("contact_gap", ())]  # of the state before the step
+        trace.pass_invariants += [
+            item.value for item in self.finished.get("contact_gap", ())
+        ]  # of the state before the step
         if status or "contact_excess" in self.reports:
             trace.graph.step = "excess|e"
             self.excess = [self._last(largest(values)) for values in (*excess[:2], efforts, excess[2])]
-        trace.begin = sent_ahead + kept.begin
+        trace.prologue = sent_ahead + kept.begin
         after = self._after(qdd, status)
-        if trace.piece is None:
+        if trace.segment is None:
             return passed + kept.end + after
-        trace.news = after
+        trace.final_messages = after
         return sent + passed + kept.end
 
     def _forces(
@@ -160,7 +162,7 @@ class ContactStep(Step):
 
     # -- bodies that touch each other ------------------------------------------------------------------------------
     def close(self, done: dict, rates: dict) -> dict:
-        """Return the rates of a piece, by link, with what forces between its bodies and others add."""
+        """Return the rates of a segment, by link, with what forces between its bodies and others add."""
         return rates
 
     def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, tuple[Vector, Vector]]) -> dict[int, Value]:
@@ -179,7 +181,7 @@ class ContactStep(Step):
         return [], [], [], []
 
     def reported(self) -> list[Store]:
-        """Return the stores of reports on bodies that touch each other that follow after all pieces are done."""
+        """Return the stores of reports on bodies that touch each other that follow after all segments are done."""
         return []
 
     # -- hinges ----------------------------------------------------------------------------------------------------
@@ -247,7 +249,7 @@ class ContactStep(Step):
                 P, push = chosen(touched, (P + more, push + pushed), (P, push), f"walls of {key}")
             if key in self.crowds:
                 P, push = self.crowds[key].damped(P, push)
-            trace.dampers[key], trace.pushes[key] = P, push
+            trace.contact_inertia[key], trace.contact_force[key] = P, push
 
     def _sum(self, pressed: list[tuple[Point, Touch]]) -> tuple[Articulated, Vector]:
         """Return the sums of dampers and loads of points of one link."""
@@ -318,8 +320,8 @@ class ContactStep(Step):
         results = [item.value for item in stores]
         for name in self.reports:
             stores += self.finished[name]
-        if trace.piece is not None:
-            return stores + self._sent_to_the_first(trace.piece, results, status)
+        if trace.segment is not None:
+            return stores + self._sent_to_the_first(trace.segment, results, status)
         if self.excess and any(more := self.last_excess()):
             self.excess = [largest([own, *others]) for own, others in zip(self.excess, more, strict=True)]
         stores += self._excess_stores()
@@ -328,20 +330,20 @@ class ContactStep(Step):
             stores.append(Store("status", (), self._verdict(self._word(results, False))))
         return stores
 
-    def _sent_to_the_first(self, own: Piece, results: list[Value], status: bool) -> list[Store]:
-        """Return the stores that send a piece's excess and status to the first piece, which stores the world's."""
+    def _sent_to_the_first(self, own: Segment, results: list[Value], status: bool) -> list[Store]:
+        """Return the stores that send a segment's excess and status to the first segment, which stores the world's."""
         trace, sent = self.trace, []
         if self.excess:
             sent += trace.send("E", own, self.excess)
             if own.index == 0:
-                pieces = Pieces(trace.links).pieces
-                sent_by = zip(*(trace.receive("E", piece) for piece in pieces), strict=True)
+                segments = Segments(trace.links).all
+                sent_by = zip(*(trace.receive("E", segment) for segment in segments), strict=True)
                 kinds = ((*values, *more) for values, more in zip(sent_by, self.last_excess(), strict=True))
                 self.excess = [largest(list(values)) for values in kinds]
         sent += self._words(own, results) if status else []
         first = [*self._excess_stores(), *self.reported()] if own.index == 0 else []
         if first:
-            trace.rounds = [[*first, *(item for turn in trace.rounds for item in turn)]]
+            trace.final_stores = [[*first, *(item for turn in trace.final_stores for item in turn)]]
         return sent
 
     def _excess_stores(self) -> list[Store]:

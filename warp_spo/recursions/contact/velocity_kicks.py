@@ -48,7 +48,7 @@ def middle_kick(trace: Trace) -> list[Store]:
     """out = k, q_out = the coordinates half way along u, path_out = u"""
     kick, u, half, stores = _kick(trace)
     for link in trace.own_links:
-        if link.leads:
+        if link.is_leader:
             stores += [Store("q_out", (at,), value) for at, value in half(link).items()]
             stores += [Store(name, (i,), of[i]) for name, of in (("out", kick), (f"{PATH}_out", u)) for i in link.dofs]
     return stores
@@ -59,7 +59,7 @@ def last_kick(trace: Trace, qdd: bool = False) -> list[Store]:
     kick, _, _, stores = _kick(trace)
     (_, found, kicked), gained, h = _rates_and_kicks(trace), trace.vector(GAINED), trace.graph.input("dt", 0)
     for link in trace.own_links:
-        for dof in link.dofs if link.leads else ():
+        for dof in link.dofs if link.is_leader else ():
             stores.append(Store("out", (dof,), found(dof) + 2.0 * (kick[dof] - kicked(dof))))
             if qdd:
                 stores.append(Store("qdd_out", (dof,), gained(dof) + 2.0 * kick[dof] * reciprocal(h)))
@@ -84,10 +84,10 @@ def _kick(trace: Trace) -> tuple[dict[int, Value], dict[int, Value], Callable[[L
         return dict(enumerate(integrate_link(link, start, u.__getitem__, 0.5 * h), link.coordinate))
 
     there = {at: x for link in trace.links.leaders for at, x in half(link).items()}
-    trace.instead = {"q": there.__getitem__, "qd": b.__getitem__}
+    trace.substitutes = {"q": there.__getitem__, "qd": b.__getitem__}
     across = inverse_dynamics(trace, gravity=False, qdd=zero, letter="f")
     forces = {item.index[0]: item.value for item in across if item.array == "out"}
-    trace.instead["qd"] = a.__getitem__
+    trace.substitutes["qd"] = a.__getitem__
     done, rates, sent = reduce(trace, forces.__getitem__, moves=True, loads=False)
     along = expand(trace, done, rates, (ZERO, ZERO))
     kick = {item.index[0]: 0.5 * h * item.value for item in along if item.array == "out"}

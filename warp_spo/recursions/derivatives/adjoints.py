@@ -86,7 +86,7 @@ def forward_dynamics_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
     power = Power(trace, lambda dof: -solved(dof), qdd)
     others = tuple(name for name in wrt if name != "tau")
     stores = power.stores + gradient_stores(trace, power.ways, others, wrt)
-    dofs = [dof for link in trace.own_links for dof in link.dofs if link.leads] if "tau" in wrt else []
+    dofs = [dof for link in trace.own_links for dof in link.dofs if link.is_leader] if "tau" in wrt else []
     return stores + [Store(result_name("tau", wrt), (dof,), solved(dof)) for dof in dofs]
 
 
@@ -214,7 +214,7 @@ def step_vjp(trace: Trace, wrt: tuple[str, ...], equations: TreeEquations | None
         armature = (a + stiff[dof] for a, dof in zip(link.armature, link.dofs, strict=True))
         return dataclasses.replace(link, armature=tuple(armature))
 
-    trace.stiffened = stiffened
+    trace.with_step_armature = stiffened
     solved, tau = equations.solve(lambda dof: h * rates[dof]), trace.vector("tau")
     right = {dof: h * rates[dof] - stiff[dof] * solved[dof] for dof in dofs}
     ways = equations.gradient(solved, qdd, lambda dof: tau(dof) + forces[dof], right.__getitem__)
@@ -272,10 +272,10 @@ def entries(trace: Trace, name: str, found: dict[tuple, Value]) -> Iterable[tupl
         return _value_entries(trace, name, found)
     elif name in COORDINATES:
         places = [
-            (link.coordinate + c,) for link in trace.own_links for c in range(link.hinge.coordinates) if link.leads
+            (link.coordinate + c,) for link in trace.own_links for c in range(link.hinge.coordinates) if link.is_leader
         ]
     else:
-        places = [(dof,) for link in trace.own_links for dof in link.dofs if link.leads]
+        places = [(dof,) for link in trace.own_links for dof in link.dofs if link.is_leader]
     return [(place, found.get((name, *place), 0.0)) for place in places]
 
 

@@ -12,7 +12,7 @@ with lambda, qdd and the slopes held, plus that of s'. Forces f, laws l, S and w
 the last one alone, the others frozen, gradients by tau of a quadruped on the ground are wrong by 7 to 34 % in the
 median.
 
-A pass takes two traces, so that limbs share both. The first one solves: inward, outward, and the cotangents of what
+A pass takes two traces, so that segments share both. The first one solves: inward, outward, and the cotangents of what
 the pass before left, for which the first trace of that pass waits. The second one takes gradients inward.
 
 Where velocity terms are kicks, s' depends on the inertia that joints feel in the pass, that is, on the articulated
@@ -42,7 +42,7 @@ from ..contact.velocity_kicks import KICK, PATH, START
 from ..coordinates import integrate_link
 from ..kinematics import carried_velocity
 from ..model.links import Link
-from ..model.segments import Piece, Pieces
+from ..model.segments import Segment, Segments
 from ..motion import hinge_motion, whirl
 from .adjoints import entries, result_name
 from .contact_pass import NUMBER, OnePass
@@ -56,13 +56,14 @@ COTANGENT, CAME, SOLVED = "cotangent", "cotangent_came", "solved"
 """The gradient by what a pass leaves, qdd of each dof and then the variables; by what the pass before left, likewise;
 and lambda [world, dof]."""
 INERTIA = "inertia_cotangent"
-"""The gradient by the packed articulated inertia that each piece of :attr:`.OnePass.weighed` carries [world, entry]."""
+"""The gradient by the packed articulated inertia that each segment of :attr:`.OnePass.weighed` carries [world,
+entry]."""
 HEIGHTS_AT = "heights_at"
 """Columns of the heights of a cell in the table of gradients by surface [world, surface]."""
 ORIGIN = "ground_origin"
 OF_DOFS = ("q", "qd", "tau", "target_q", "target_qd", "joint_rest_q", *DOF_VALUES)
-BY_PIECES = (*OF_DOFS, "ctrl", *CONTACT_VALUES, HEIGHTS, ORIGIN, START, KICK, PATH)
-"""Arguments and values whose gradient a limb computes by itself, or by messages between limbs."""
+BY_SEGMENTS = (*OF_DOFS, "ctrl", *CONTACT_VALUES, HEIGHTS, ORIGIN, START, KICK, PATH)
+"""Arguments and values whose gradient a segment computes by itself, or by messages between segments."""
 Twists = dict[int, tuple[Vector, Vector]]
 
 
@@ -101,7 +102,7 @@ class PassAdjoint(OnePass):
         if not (self._carrier or any(map(self._weighs, self.links))):
             return done
         self._press(self.points, self.touches)
-        trace.pushes, trace.stiffened = {}, self._with_resistance
+        trace.contact_force, trace.with_step_armature = {}, self._with_resistance
         for link, outward in trace.traversal():
             if outward:
                 trace.place(link)
@@ -110,20 +111,22 @@ class PassAdjoint(OnePass):
         return done
 
     @property
-    def _carrier(self) -> Piece | None:
-        """The piece that this one moves on, if that is one of those weighed."""
-        piece = self.trace.piece
-        above = None if piece is None else piece.parent
+    def _carrier(self) -> Segment | None:
+        """The segment that this one moves on, if that is one of those weighed."""
+        segment = self.trace.segment
+        above = None if segment is None else segment.parent
         return above if above is not None and above.index in self.weighed else None
 
     @property
     def _inertia_message(self) -> list[Value]:
-        """Message of the piece's articulated inertia, with the dampers of its points on the link that it moves on."""
-        piece = self.trace.piece
-        if self._carrier is None or piece is None:
+        """Message of the segment's articulated inertia, with the dampers of its points on the link that it moves on."""
+        segment = self.trace.segment
+        if self._carrier is None or segment is None:
             return []
-        P, link = self.inner[id(piece.links[0])], piece.links[0]
-        return (P + self.trace.dampers[id(link.parent)] if id(link.parent) in self.trace.dampers else P).packed
+        P, link = self.inner[id(segment.links[0])], segment.links[0]
+        return (
+            P + self.trace.contact_inertia[id(link.parent)] if id(link.parent) in self.trace.contact_inertia else P
+        ).packed
 
     def _find_points(self) -> list[Point]:
         """Return the contact points."""
@@ -144,7 +147,7 @@ class PassAdjoint(OnePass):
         return twist
 
     def _or_input(self, known: dict[int, Value], name: str) -> Entry:
-        """Return entries by dof: those that are known, or of the dofs of other pieces the inputs."""
+        """Return entries by dof: those that are known, or of the dofs of other segments the inputs."""
         read = self.trace.vector(name)
         return lambda dof: known[dof] if dof in known else read(dof)
 
@@ -186,7 +189,7 @@ class PassSolve(PassAdjoint):
         return _cut(twist[0]), _cut(twist[1])
 
     def stores(self) -> list[Store]:  # type: ignore[override]
-        """Return the stores of lambda and of the cotangents, and messages to other pieces."""
+        """Return the stores of lambda and of the cotangents, and messages to other segments."""
         trace = self.trace
         on = list({id(point.link): None for point in self.points if point.link is not None})
         results, seeds = self._results()
@@ -195,8 +198,8 @@ class PassSolve(PassAdjoint):
         right = {dof: way + self._of_later(COTANGENT, dof) for dof, way in zip(self.qdd, direct, strict=False)}
         self._press(self.points, self.touches)
         wrenches = direct[len(self.qdd) :]
-        trace.pushes = {key: Vector(wrenches[6 * at : 6 * at + 6]) for at, key in enumerate(on)}
-        trace.stiffened = self._with_resistance
+        trace.contact_force = {key: Vector(wrenches[6 * at : 6 * at + 6]) for at, key in enumerate(on)}
+        trace.with_step_armature = self._with_resistance
         done, rates, sent = reduce(trace, right.__getitem__, moves=False, loads=False)
         pushed: Twists = {}
         found = expand(trace, done, rates, (ZERO, ZERO), alpha=pushed)
@@ -218,32 +221,32 @@ class PassSolve(PassAdjoint):
         ]
 
     def _tell(self, results: list[Value], seeds: list[Value]) -> list[Store]:
-        """Return the stores of the gradient by what pieces carry, and those that tell it to the pieces carried."""
+        """Return the stores of the gradient by what segments carry, and those that tell it to the segments carried."""
         trace, found = self.trace, []
         for at, index in enumerate(self.weighed):
-            piece = trace.piece or Pieces(trace.links).pieces[index]
-            if piece.index != index:
+            segment = trace.segment or Segments(trace.links).all[index]
+            if segment.index != index:
                 continue
-            carried = trace.from_children(piece.links[-1], "P", self.inner, Articulated.unpacked)[0].packed
+            carried = trace.from_children(segment.links[-1], "P", self.inner, Articulated.unpacked)[0].packed
             ways = _by_each(carried, reverse(results, _distinct(carried), seeds, True))
             found += [Store(f"{INERTIA}_out", (len(ways) * at + i,), way) for i, way in enumerate(ways)]
-            found += trace.send("Q", piece, ways)
+            found += trace.send("Q", segment, ways)
         return found
 
 
 class PassGradient(PassAdjoint):
     """Gradients of a pass, and of what follows the last one and precedes the first.
 
-    A piece takes what its points know of the link that it moves on as given, and sends the gradient by that inward.
+    A segment takes what its points know of the link that it moves on as given, and sends the gradient by that inward.
 
     Attributes:
-        given: what the piece takes as given, each scalar cut from its history. passed_on: what its children take.
+        given: what the segment takes as given, each scalar cut from its history. passed_on: what its children take.
     """
 
     def __init__(self, trace: Trace, laws: tuple[int, ...]):
-        piece = trace.piece
-        self._under = None if piece is None or piece.parent is None else piece.parent.links[-1]
-        self._end = piece.links[-1] if piece is not None and piece.children else None
+        segment = trace.segment
+        self._under = None if segment is None or segment.parent is None else segment.parent.links[-1]
+        self._end = segment.links[-1] if segment is not None and segment.children else None
         self._reached = with_ancestors(point_links(trace.links))
         self.given: list[Value] = []
         self.passed_on: list[Value] = []
@@ -289,7 +292,8 @@ class PassGradient(PassAdjoint):
         return apart
 
     def stores(self, wrt: tuple[str, ...]) -> list[Store]:  # type: ignore[override]
-        """Return the stores of the gradients by ``wrt``, those of later passes added, and messages to other pieces."""
+        """Return the stores of the gradients by ``wrt``, those of later passes added, and messages to other
+        segments."""
         trace, kept = self.trace, self.kept
         results, seeds = self._results()
         results += [self._power(self.solved, self.pushed), *(item.value for item in kept.begin)]
@@ -302,9 +306,9 @@ class PassGradient(PassAdjoint):
                 results + packed,
                 seeds + [trace.graph.input(INERTIA, first + i) for i in range(len(packed))],
             )
-        for piece in trace.piece.children if trace.piece is not None else ():
+        for segment in trace.segment.children if trace.segment is not None else ():
             results += self.passed_on
-            seeds += trace.receive("G", piece)[: len(self.passed_on)]
+            seeds += trace.receive("G", segment)[: len(self.passed_on)]
         held = [*self.qdd.values(), *self.solved.values(), *self.before.values(), *kept.variables.values()]
         stops = _distinct([*self.given, *held])
         leaves = [x for x in ordered(results, stops) if x.op == "input"]
@@ -327,18 +331,18 @@ class PassGradient(PassAdjoint):
             if name == HEIGHTS:
                 cells = zip(self.surfaces, (point.cell for point in self.points), strict=True)
                 found += [Store(f"{HEIGHTS_AT}_bar", (at,), cell.first) for at, cell in cells if cell is not None]
-            if name == ORIGIN and trace.piece is not None:
-                sent += self._add_origins(trace.piece, ways)
-                if trace.piece.parent is not None:
+            if name == ORIGIN and trace.segment is not None:
+                sent += self._add_origins(trace.segment, ways)
+                if trace.segment.parent is not None:
                     continue
             for index, value in self._entries(name, ways):
                 found.append(Store(result_name(name, wrt), index, self._of_later(f"{name}_later", *index) + value))
         return [*sent, *power.stores, *found]
 
-    def _add_origins(self, own: Piece, ways: Ways) -> list[Store]:
-        """Add to the gradient by the ground's origin those of the pieces further out; return what sends it inward."""
-        for piece in own.children:
-            for i, more in enumerate(self.trace.receive("O", piece)):
+    def _add_origins(self, own: Segment, ways: Ways) -> list[Store]:
+        """Add to the gradient by the ground's origin those of the segments further out; return what sends it inward."""
+        for segment in own.children:
+            for i, more in enumerate(self.trace.receive("O", segment)):
                 ways[ORIGIN, i] = ways.get((ORIGIN, i), 0.0) + more
         sums = [ways.get((ORIGIN, i), 0.0) for i in range(3)]
         return self.trace.send_to_parent("O", own.links[0], sums)
@@ -350,9 +354,9 @@ class PassGradient(PassAdjoint):
         """
         if name == HEIGHTS:
             places: Iterable[tuple[int, ...]] = itertools.product(self.surfaces, range(CORNERS))
-        elif self.trace.piece is not None and name in CONTACT_VALUES:
+        elif self.trace.segment is not None and name in CONTACT_VALUES:
             places = [(number,) for number, _ in own_points(self.trace)]
-        elif self.trace.piece is not None and name == "ctrl":
+        elif self.trace.segment is not None and name == "ctrl":
             places = [(number,) for number in self._controls(list(self.before))]
         else:
             return entries(self.trace, name, ways)
@@ -370,12 +374,12 @@ def contact_gradient(trace: Trace, laws: tuple[int, ...], wrt: tuple[str, ...], 
 
 
 def divides(scene: Scene, variable: Collection[str], inputs: Collection[str], wrt: Collection[str]) -> bool:
-    """Return whether limbs can share the gradients of a pass."""
+    """Return whether segments can share the gradients of a pass."""
     alone = all(len(actuator.hinges) == 1 for actuator in scene.actuators)
     lifted = "body_gravcomp" in variable or bool(scene.values["body_gravcomp"].any())
     alone &= len(scene.tree.roots) == 1 or ORIGIN not in wrt  # its gradient is added up towards the root
     alone &= "body_f" not in inputs
-    return alone and not lifted and set(wrt) <= set(BY_PIECES)
+    return alone and not lifted and set(wrt) <= set(BY_SEGMENTS)
 
 
 def _distinct(values: Iterable[Value]) -> list[Scalar]:

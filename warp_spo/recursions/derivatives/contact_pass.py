@@ -2,7 +2,7 @@
 
 Gradients need that of every pass. The variables of a pass lie in a row [world, variable]: first those of the hinges'
 laws, link after link, then three for each surface that a point may touch. The order is the same for the whole tree and
-for its pieces.
+for its segments.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ..contact.points import Point, own_points, surface_numbers
 from ..contact.secant_laws import Kept, single_dofs
 from ..contact.step import ContactStep, Touch
 from ..model.links import Link, Links
-from ..model.segments import Pieces
+from ..model.segments import Segments
 from ..step.joint_laws import LIMIT, Law
 from ..step.step import GAIN
 
@@ -87,13 +87,17 @@ class OnePass(ContactStep):
 
     @functools.cached_property
     def weighed(self) -> tuple[int, ...]:
-        """Numbers of the pieces that carry others whose inertia counts in what laws leave for the next pass."""
+        """Numbers of the segments that carry others whose inertia counts in what laws leave for the next pass."""
         if not self.kicked:
             return ()
-        pieces = Pieces(self.trace.links).pieces
-        own = {piece.index for piece in pieces if any(self._weighs(link) for link in piece.links if link.leads)}
-        chains = {piece.index: {piece.index, *(further.index for further in piece.ancestors)} for piece in pieces}
-        return tuple(piece.index for piece in pieces if piece.children and own & chains[piece.index])
+        segments = Segments(self.trace.links).all
+        own = {
+            segment.index for segment in segments if any(self._weighs(link) for link in segment.links if link.is_leader)
+        }
+        chains = {
+            segment.index: {segment.index, *(further.index for further in segment.ancestors)} for segment in segments
+        }
+        return tuple(segment.index for segment in segments if segment.children and own & chains[segment.index])
 
     def _weighs(self, link: Link) -> bool:
         """Whether what a law of the link leaves for the next pass depends on the inertia that its dof feels."""
@@ -125,12 +129,17 @@ class OnePass(ContactStep):
         """Make no crowds: every point is computed in every pass, and what a pass leaves are variables of points."""
 
     def forward(self) -> list[Store]:
-        """Return the stores of what the pass leaves, and messages to other pieces."""
+        """Return the stores of what the pass leaves, and messages to other segments."""
         trace = self.trace
         dofs = {self._kept.get(dof, dof): dof for dof in self.before}
         stores = self.stores(qdd=False, status=False)
-        sent = [item for item in trace.begin if item.array != ROW]
-        trace.begin, trace.ahead, trace.news, trace.rounds = [], [], [], []  # there is no loop
+        sent = [item for item in trace.prologue if item.array != ROW]
+        trace.prologue, trace.pass_invariants, trace.final_messages, trace.final_stores = (
+            [],
+            [],
+            [],
+            [],
+        )  # there is no loop
         after = (GAIN, "out", "q_out", *(item.array for item in self.kept.end))
         sent += [item for item in stores if item.array not in after]
         gains = [
@@ -151,7 +160,7 @@ def count_laws(trace: Trace) -> tuple[int, ...]:
     return OnePass(trace, None).counted
 
 
-def weighed_pieces(trace: Trace) -> tuple[int, ...]:
+def weighed_segments(trace: Trace) -> tuple[int, ...]:
     """Return :attr:`OnePass.weighed`."""
     return OnePass(trace, None).weighed
 

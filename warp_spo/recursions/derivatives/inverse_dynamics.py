@@ -15,7 +15,7 @@ from ...trace.spatial import ZERO, Rigid, Vector, cross, dot
 from .. import composite, motion, newton_euler
 from ..model import messages
 from ..model.links import Link, Placed
-from ..motion import STILL, Motion
+from ..motion import STILL, VelocityTerms
 from . import sensitivity
 from .sensitivity import CarriedSums, Row, Sensitivity
 
@@ -40,7 +40,7 @@ def inverse_dynamics_derivatives(trace: Trace, mass: bool = True) -> list[Store]
     stores: list[Store] = []
     for link, outward in trace.traversal():
         key, over = id(link), link.parent
-        parent: Motion = STILL if over is None else trace.motions[id(over)]
+        parent: VelocityTerms = STILL if over is None else trace.motions[id(over)]
         if outward:
             trace.place(link, moves)
             place = trace.places[key]
@@ -75,11 +75,11 @@ def inverse_dynamics_derivatives(trace: Trace, mass: bool = True) -> list[Store]
                 inner[letter][key] = values[letter]
                 stores += trace.send_to_parent(letter, link, values[letter])
         stores += _entries(trace, link, all_in, (n, f), own, drifts, shared)
-        for (i, j), x in link.coupled.items():
+        for (i, j), x in link.coupling_inertia.items():
             a, b = link.dofs[i], link.dofs[j]
             stores += [Store("out", (QDD, a, b), x), Store("out", (QDD, b, a), x)]
     stores = [item for item in stores if mass or item.array != "out" or item.index[0] != QDD]
-    return merge(stores) if trace.links.shared else stores
+    return merge(stores) if trace.links.shares_dofs else stores
 
 
 def _wrenches(trace: Trace, link: Link) -> list[tuple[Vector, Vector, Vector]]:
@@ -139,9 +139,9 @@ def _entries(
             pose = trace.places[id(over)].pose
             row = row.to_parent(trace.places[id(over)], drifts[id(over)])
             blocks = [*((block, *pose.force_to_parent(n, f)) for block, n, f in blocks[:2]), (QDD, row.w, row.v)]
-            if over is link and link.group is not None:  # links of a group go on together from the last one
+            if over is link and link.shared_dofs is not None:  # links of a group go on together from the last one
                 row, blocks = shared[dof] = _sum_of_links(shared[dof], row, blocks) if dof in shared else (row, blocks)
-                if not link.closes:
+                if not link.is_last:
                     break
             over = over.parent
             for block, n, f in blocks:
@@ -198,7 +198,7 @@ def mass_matrix_derivative(trace: Trace) -> list[Store]:
                             continue
                         value = value + _power(changes[j], momenta[i])
                     stores += [Store("out", (*at, dof), value) for at in {(i, j), (j, i)}]
-    return merge(stores) if trace.links.shared else stores
+    return merge(stores) if trace.links.shares_dofs else stores
 
 
 def _column_changes(link: Link, place: Placed, heads: dict, dof: int) -> dict[int, tuple[Vector, Vector]]:

@@ -80,7 +80,7 @@ class FromParent(NamedTuple):
 
 
 class Power:
-    """The sum for one trace, of a whole scene or of a piece, and its gradient.
+    """The sum for one trace, of a whole scene or of a segment, and its gradient.
 
     Args:
         multiplier, qdd: lambda and the accelerations, by dof: inputs, or what other recursions make.
@@ -88,7 +88,7 @@ class Power:
 
     Attributes:
         ways: gradient by entries of "q", "qd", "qdd", "body_f" and of the scene's values, by name and index.
-        stores: messages to other pieces. forces: tau, by dof.
+        stores: messages to other segments. forces: tau, by dof.
     """
 
     def __init__(

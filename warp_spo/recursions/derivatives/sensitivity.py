@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from ...trace.scalars import Value
 from ...trace.spatial import ZERO, Matrix, Rigid, Vector, cross, dot, skew, symmetric
 from ..model.links import Link, Placed
-from ..motion import NONE, Motion, carry_acceleration, hinge_motion, whirl
+from ..motion import NONE, VelocityTerms, carry_acceleration, hinge_motion, whirl
 
 
 class Sensitivity(NamedTuple):
@@ -109,7 +109,7 @@ class Row(NamedTuple):
 EMPTY = CarriedSums(Rigid(0.0, ZERO, NONE), NONE, ZERO, NONE, ZERO)
 
 
-def drift(link: Link, place: Placed, parent: Motion | None, qd: object) -> Vector:
+def drift(link: Link, place: Placed, parent: VelocityTerms | None, qd: object) -> Vector:
     """Velocity of the link's origin relative to its parent's, in the parent's axes."""
     if qd is None:
         return ZERO
@@ -117,7 +117,7 @@ def drift(link: Link, place: Placed, parent: Motion | None, qd: object) -> Vecto
     return own if parent is None else own + cross(parent.spin, place.pose.l)
 
 
-def of_body(inertia: Rigid | None, motion: Motion) -> CarriedSums:
+def of_body(inertia: Rigid | None, motion: VelocityTerms) -> CarriedSums:
     """A body that turns about its link's origin: u = omega x rho."""
     if inertia is None:
         return EMPTY
@@ -155,8 +155,8 @@ def _lever(arm: Vector, f: Vector) -> Matrix:
 def of_coordinates(
     link: Link,
     place: Placed,
-    motion: Motion,
-    parent: Motion,
+    motion: VelocityTerms,
+    parent: VelocityTerms,
     above: tuple[Vector, Vector],
     own: tuple[Vector, Vector],
     rates: Any,
@@ -203,7 +203,7 @@ def _entries_of(link: Link, entry: Any) -> list[Value]:
     return [entry(dof) for dof in link.dofs]
 
 
-def of_rates(link: Link, place: Placed, motion: Motion, parent: Motion, rates: Any) -> list[Sensitivity]:
+def of_rates(link: Link, place: Placed, motion: VelocityTerms, parent: VelocityTerms, rates: Any) -> list[Sensitivity]:
     """Per unit of each rate of a link; ``rates``: qd by dof, or None."""
     spin_c = place.pose.to_child(parent.spin)
     both = spin_c + motion.spin

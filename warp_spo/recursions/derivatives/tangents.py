@@ -15,7 +15,7 @@ def tangent_gradient(trace: Trace, gradient: dict[tuple, Value]) -> list[tuple[t
     """Return (index, value) of the gradient along tangent coordinates, for the ``gradient`` by entries of q."""
     entries: list[tuple[tuple[int, ...], Value]] = []
     for link in trace.own_links:
-        if not link.leads:
+        if not link.is_leader:
             continue
         trace.label(link, "g")
         own = [gradient.get(("q", link.coordinate + i), 0.0) for i in range(link.hinge.coordinates)]

@@ -76,7 +76,7 @@ class ClosedStep(Step):
         self.margins_after += tied.space.margins
         for _ in range(count):
             step = tied.space.particular([-g for g in tied.errors(places, q.__getitem__)])
-            for link in (link for link in cluster.links if link.leads):
+            for link in (link for link in cluster.links if link.is_leader):
                 new = integrate_link(link, q.__getitem__, lambda dof: step.get(dof, 0.0), 1.0)  # noqa: B023
                 q |= {link.coordinate + c: value for c, value in enumerate(new)}
             places = place()
@@ -110,7 +110,7 @@ class MultiplierStep(Step):
 
     def system(self) -> list[Store]:
         """out, right, size: what the multipliers solve."""
-        self.trace.stiffened = self._with_resistance
+        self.trace.with_step_armature = self._with_resistance
         tau = self.trace.vector("tau")
         return loop_system(self.trace, lambda dof: tau(dof) + self.forces[dof])
 

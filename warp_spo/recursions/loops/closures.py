@@ -19,7 +19,7 @@ from ...scene.parts import Coupling, Loop, in_plane
 from ...trace.scalars import Value, less, reciprocal
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, dot, total
 from .. import articulated
-from ..model.links import Link, Links, Placed, Seat
+from ..model.links import BodyPlacement, Link, Links, Placed
 from ..motion import hinge_motion, own_bias
 
 PARALLEL = 1e-6  # sine of the angle between two axes of a loop joint, below which they are one
@@ -92,7 +92,10 @@ class Closure:
     """
 
     def __init__(self, links: Links, loop: Loop):
-        self.inner, self.outer = links.seat(loop.parent, loop.parent_pose), links.seat(loop.child, loop.child_pose)
+        self.inner, self.outer = (
+            links.placement(loop.parent, loop.parent_pose),
+            links.placement(loop.child, loop.child_pose),
+        )
         inner, outer = _ancestors(self.inner.link), _ancestors(self.outer.link)
         while inner and outer and inner[0] is outer[0]:
             del inner[0], outer[0]
@@ -208,7 +211,7 @@ def _state_of_link(link: Link, place: Placed, over: State, qd: Any, qdd: Any) ->
     return State(axes, over.origin + d, spin, velocity, rate, acceleration)
 
 
-def _state_of_anchor(link: State, anchor: Seat) -> State:
+def _state_of_anchor(link: State, anchor: BodyPlacement) -> State:
     s = link.axes @ anchor.offset
     velocity = link.velocity + cross(link.spin, s)
     acceleration = link.acceleration + cross(link.spin_rate, s) + cross(link.spin, cross(link.spin, s))

@@ -35,9 +35,9 @@ class Embedding(NamedTuple):
 class Swept(NamedTuple):
     """Results of the inward sweep that the outward sweep reads, by link outside clusters and by cluster."""
 
-    links: dict[int, articulated.Factor]
+    links: dict[int, articulated.LinkFactor]
     link_rates: dict[int, list[Value]]
-    clusters: dict[int, aggregates.Factor]
+    clusters: dict[int, aggregates.ClusterFactor]
     cluster_rates: dict[int, list[Value]]
     demanded: dict[int, Columns]  # the qdd of a cluster at zero rates of its basis
     margins: list[Value]
@@ -68,8 +68,8 @@ class ClosedLoops:
         """The clusters, in the order of their first links."""
         found = aggregates.clusters(self.trace.links, self.constraints)
         tied = {id(link) for cluster in found for link in cluster.links}
-        groups = [link for link in self.trace.links.links if link.group is not None and link.leads]
-        found += [Cluster(link.group.links, link.parent, []) for link in groups if id(link) not in tied]  # type: ignore[union-attr]
+        groups = [link for link in self.trace.links.links if link.shared_dofs is not None and link.is_leader]
+        found += [Cluster(link.shared_dofs.links, link.parent, []) for link in groups if id(link) not in tied]  # type: ignore[union-attr]
         tied |= {id(link) for cluster in found for link in cluster.links}
         return found + [Cluster([link], link.parent, []) for link in self._alone if id(link) not in tied]
 
@@ -158,7 +158,7 @@ class ClosedLoops:
     ) -> tuple[Articulated, Vector]:
         """Eliminate a link that is in no cluster; return P+ and z+ in its parent's frame."""
         key, place, move = id(link), self.trace.places[id(link)], self.trace.motions[id(link)]
-        stiff = self.trace.stiffened(link)
+        stiff = self.trace.with_step_armature(link)
         swept.links[key] = done = articulated.factor(stiff, place, carried, through, self.trace.epsilon)
         self.trace.label(link, "z")
         right = [tau(dof) for dof in link.dofs]
@@ -181,13 +181,19 @@ class ClosedLoops:
         swept.demanded[key] = k
         self.label(cluster, "D")
         swept.clusters[key] = done = aggregates.factor(
-            cluster, space, self.trace.places, own, self.trace.epsilon, self.trace.stiffened
+            cluster, space, self.trace.places, own, self.trace.epsilon, self.trace.with_step_armature
         )
         self.label(cluster, "z")
         t, force = aggregates.hinge_forces(
-            cluster, self.trace.places, self.trace.motions, own, z, lambda dof: k.get(dof, 0.0), self.trace.stiffened
+            cluster,
+            self.trace.places,
+            self.trace.motions,
+            own,
+            z,
+            lambda dof: k.get(dof, 0.0),
+            self.trace.with_step_armature,
         )
-        eps = [done.nothing + total(x * (tau(dof) - t[dof]) for dof, x in column.items()) for column in done.X]
+        eps = [done.lost_pivot + total(x * (tau(dof) - t[dof]) for dof, x in column.items()) for column in done.X]
         swept.cluster_rates[key] = rates = done.solve(eps)
         for column, rate in zip(done.U, rates, strict=True):
             force = force + column * rate

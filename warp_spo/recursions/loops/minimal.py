@@ -38,7 +38,7 @@ def columns_of(loops: ClosedLoops, cluster: Cluster, moves: bool) -> tuple[dict[
         for dof in cluster.dofs
         if dof in loops.embedding.dofs
     }
-    return X, loops.demanded(tied) if moves else {}, tied.space.nothing
+    return X, loops.demanded(tied) if moves else {}, tied.space.lost_pivot
 
 
 def columns_of_all(loops: ClosedLoops) -> dict[int, Columns]:
@@ -128,12 +128,12 @@ def log_det_mass_matrix(trace: Trace, embedding: Embedding) -> list[Store]:
     loops = ClosedLoops(trace, embedding)
 
     def allowed(cluster: Cluster) -> tuple[Basis, Columns]:
-        X, k, nothing = columns_of(loops, cluster, moves=False)
-        return Basis(list(X.values()), nothing), k
+        X, k, lost_pivot = columns_of(loops, cluster, moves=False)
+        return Basis(list(X.values()), lost_pivot), k
 
     swept = loops.sweep(lambda dof: 0.0, moves=False, loads=False, allowed=allowed)
     D = [pivot.D for done in swept.links.values() for pivot in done.pivots]
-    D += [d + done.nothing for done in swept.clusters.values() for d in done.d]
+    D += [d + done.lost_pivot for done in swept.clusters.values() for d in done.d]
     return [Store("out", (), sum_of_logarithms(D))]
 
 
@@ -217,8 +217,10 @@ def _products(loops: ClosedLoops, swept: Swept, columns: dict[int, dict[int, lis
     """out = Y* D Y, both triangles, of columns of Y = D^-1 [I - H psi K] ..."""
     D = {key: [pivot.D for pivot in done.pivots] for key, done in swept.links.items()}
     D |= {key: done.d for key, done in swept.clusters.items()}
-    nothing = [done.nothing for done in swept.links.values()] + [done.nothing for done in swept.clusters.values()]
-    return mirror(weighted_products(loops.trace, D, total(nothing), columns))
+    lost_pivot = [done.lost_pivot for done in swept.links.values()] + [
+        done.lost_pivot for done in swept.clusters.values()
+    ]
+    return mirror(weighted_products(loops.trace, D, total(lost_pivot), columns))
 
 
 def hybrid_dynamics(trace: Trace, embedding: Embedding, mask: tuple[bool, ...]) -> list[Store]:
@@ -235,11 +237,11 @@ def hybrid_dynamics(trace: Trace, embedding: Embedding, mask: tuple[bool, ...]) 
         if not any(mask[dof] for dof in cluster.dofs):
             tied = loops.tie(cluster)
             return tied.space, loops.demanded(tied) if moves else {}
-        X, k, nothing = columns_of(loops, cluster, moves)
+        X, k, lost_pivot = columns_of(loops, cluster, moves)
         for dof, column in X.items():
             for other, x in column.items() if mask[dof] else ():
                 k[other] = k.get(other, 0.0) + x * given(dof)
-        return Basis([column for dof, column in X.items() if not mask[dof]], nothing), k
+        return Basis([column for dof, column in X.items() if not mask[dof]], lost_pivot), k
 
     swept = loops.sweep(tau, moves, loads=True, allowed=allowed)
     qdd = loops.outward_accelerations(swept, trace.base_acceleration)

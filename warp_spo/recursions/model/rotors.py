@@ -16,7 +16,7 @@ import numpy as np
 from ...hinges.rotor_axis import Spin
 from ...scene.gears import Rotor
 from ...trace.spatial import ZERO, Matrix, Pose, Rigid, Vector, symmetric
-from .link import Group, Link
+from .link import Link, SharedDofs
 from .rotations import aligned, still
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def add(links: Links, driven: Link, rotor: Rotor, axes: Matrix, origin: Vector) 
         com=ZERO,
         inertia=None,
         grouped=None,
-        lift=None,
+        gravity_compensation=None,
         children=[],
     )
     link.add(Rigid(0.0, ZERO, symmetric(0.0, 0.0, rotor.spin_inertia, 0.0, 0.0, 0.0)))
@@ -44,7 +44,7 @@ def add(links: Links, driven: Link, rotor: Rotor, axes: Matrix, origin: Vector) 
             link.add(across_axis(rotor))
         else:
             driven.parent.add(locked(rotor, axes, origin))
-    driven.group = link.group = Group([driven, link])
+    driven.shared_dofs = link.shared_dofs = SharedDofs([driven, link])
     links.append(link)
 
 

@@ -24,7 +24,7 @@ from ...trace.scalars import Value, absolute, is_constant, less, reciprocal, sel
 from ...trace.spatial import total
 from ..model.effective_mass import masses
 from ..model.links import Link, Links
-from ..model.scene_cache import remembered
+from ..model.scene_cache import cached_by_scene
 
 CREEP = 1e-4  # rate [rad/s, m/s] below which dry friction is a damper; it saturates at this rate
 DEFAULT_BOUND = 1e6  # effort and velocity limits of this size and more are no limits; Newton's default
@@ -186,9 +186,9 @@ class Impedance:
         return self._constant(name, index, column[0])
 
     def _constant(self, name: str, index: int, value: float) -> Value:
-        """Return a constant; pieces of one make may keep it from folding, see :mod:`.alike`."""
-        numbers = self.links.numbers
-        return float(value) if numbers is None else numbers.of_scene(name, index, float(value))
+        """Return a constant; segments of one make may keep it from folding, see :mod:`.shared_constants`."""
+        constants = self.links.shared_constants
+        return float(value) if constants is None else constants.of_scene(name, index, float(value))
 
     def _bound(self, name: str, dof: int, none: float) -> Value | None:
         """Return a bound; None if it is ``none`` or larger in all worlds, and stays so."""
@@ -297,7 +297,7 @@ def is_number(x: Value, number: float) -> bool:
     return is_constant(x) and x == number
 
 
-@remembered
+@cached_by_scene
 def neutral_inertias(scene: Scene) -> np.ndarray:
     """Return 1 / diagonal of Mass^-1 at the neutral configuration of world 0 [dof]; of Mass where it is singular."""
     mass, inverse = masses(scene)

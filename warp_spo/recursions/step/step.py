@@ -4,8 +4,8 @@ R and F are resistance and force of the hinges' laws, see :mod:`.impedance`. Whe
 the pieces at its guess of u = qd' - qd and checks whether these pieces were the right ones. Passes share one text, run
 in a loop until all were right: sweeps over the tree, or for few dofs the solution of a system formed before the loop.
 
-Pieces that work side by side keep the guesses of their own dofs and store the state after the last pass, when no other
-piece reads the state before the step any more.
+Segments that work side by side keep the guesses of their own dofs and store the state after the last pass, when no
+other segment reads the state before the step any more.
 """
 
 from __future__ import annotations
@@ -23,21 +23,20 @@ from ..articulated_sweeps import expand, reduce
 from ..coordinates import integrate_link
 from ..kinematics import body_states
 from ..model.links import Link
-from ..model.segments import Piece, Pieces
+from ..model.segments import Segment, Segments
 from ..model.tracing import Trace
 from .actuation import hinge_laws
 from .joint_laws import Law, add_laws, is_number
 from .joint_space import JointSpace
 
 GUESS, GAIN, MISSED, PASS = "guess", "gain", "missed", "pass"
-"""Variables of the loop over passes, zero at first: guess of u, and u, by dof of a piece; number of wrong guesses. And
-the number of the pass, from zero."""
+"""Variables of the loop over passes, zero at first: guess of u, and u, by dof of a segment; number of wrong guesses.
+And the number of the pass, from zero."""
 LOOPED = (GUESS, GAIN, MISSED)
 FORCE, RESISTANCE = "force", "resistance"
-"""Of the laws of a piece's dofs at their guesses, where these are found in turns."""
-MOST_LAWS = (
-    12  # dofs of unlike pieces; beyond, laws take turns in loops, because their statements are fetched too slowly
-)
+"""Of the laws of a segment's dofs at their guesses, where these are found in turns."""
+# dofs of segments that differ; beyond, laws take turns in loops, because their statements are fetched too slowly
+MOST_LAWS = 12
 SHORT = 10  # dofs; up to so many, passes solve a system that is formed once
 PATIENCE, TURNS = 8, 3  # passes after which a dof changes its guess in every third one only, one dof after the other
 FAINT = 1e-12  # resistance of a massless dof without active law, as a share of the resistances of its laws
@@ -51,7 +50,7 @@ class Step:
     """
 
     def __init__(self, trace: Trace):
-        self.trace, self.links = trace, [link for link in trace.own_links if link.leads]
+        self.trace, self.links = trace, [link for link in trace.own_links if link.is_leader]
         trace.compensate_gravity()
         vector, given = trace.vector, trace.inputs
         self.h = trace.graph.input("dt", 0)
@@ -60,19 +59,19 @@ class Step:
         self.impedance = hinge_laws(trace, self.h)
         self.laws: dict[int, list[Law]] = {}  # by dof
         self.forces: dict[int, Value] = {}
-        self.messages: list[Store] = []  # to other pieces
-        self._kept = {dof: at for at, dof in enumerate(trace.piece.dofs)} if trace.piece else {}
-        self._in_turns = trace.piece is not None and Pieces(trace.links).unlike > MOST_LAWS
+        self.messages: list[Store] = []  # to other segments
+        self._kept = {dof: at for at, dof in enumerate(trace.segment.dofs)} if trace.segment else {}
+        self._in_turns = trace.segment is not None and Segments(trace.links).distinct_dof_count > MOST_LAWS
         if self._in_turns:
             reciprocal(self.h)  # older than what turns compute alone
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
         """Return the stores out = qd', q_out = q'; with ``qdd`` qdd_out = (qd' - qd) / h, with ``status`` the status.
 
-        For a piece, the stores of one pass; stores after the last pass are the trace's ``news``.
+        For a segment, the stores of one pass; stores after the last pass are the trace's ``final_messages``.
         """
         trace = self.trace
-        trace.stiffened = self._with_resistance
+        trace.with_step_armature = self._with_resistance
         tau = trace.vector("tau")
         found = self._accelerations(lambda dof: tau(dof) + self.forces[dof])
         gains = {dof: self.h * value for dof, value in found.items()}
@@ -90,8 +89,8 @@ class Step:
                 stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
         stores = self.put_back(stores)
         results = [item.value for item in stores]
-        if trace.piece is not None:
-            trace.news = stores + (self._words(trace.piece, results) if status else [])
+        if trace.segment is not None:
+            trace.final_messages = stores + (self._words(trace.segment, results) if status else [])
             return self.messages + looped
         if status:
             trace.graph.step = "status|s"
@@ -110,7 +109,7 @@ class Step:
     @property
     def _is_short(self) -> bool:
         """Whether one thread makes several passes over few dofs."""
-        if self.trace.links.scene.dof_count > SHORT or self.trace.piece is not None:
+        if self.trace.links.scene.dof_count > SHORT or self.trace.segment is not None:
             return False
         return any(law.bends for link in self.links for laws in self.impedance.laws(link) for law in laws)
 
@@ -118,7 +117,7 @@ class Step:
         """Return the same from a system that is formed once for all passes."""
         system = JointSpace(self.trace)
         pieces: dict[int, Law] = {}
-        self.trace.ahead = [*system.mass.values(), *system.bias.values()]
+        self.trace.pass_invariants = [*system.mass.values(), *system.bias.values()]
         for link in self.links:
             self.trace.label(link, "r")
             pieces.update(zip(link.dofs, self._pieces(link), strict=True))
@@ -158,12 +157,17 @@ class Step:
         if not any(law.bends for law in self.laws[dof]):
             return piece
         at = (self._kept[dof],)
-        self.trace.laws.append(_turn([Store(FORCE, at, piece.force), Store(RESISTANCE, at, piece.resistance)]))
+        self.trace.law_stores.append(_turn([Store(FORCE, at, piece.force), Store(RESISTANCE, at, piece.resistance)]))
         return Law(self._kept_as(FORCE, dof), self._kept_as(RESISTANCE, dof))
 
     def _weightless(self, link: Link) -> bool:
         """Whether the link's one dof carries no mass and has a law with bounds, so that forces alone move it."""
-        bare = len(link.dofs) == 1 and link.group is None and is_number(link.armature[0], 0.0) and carries_nothing(link)
+        bare = (
+            len(link.dofs) == 1
+            and link.shared_dofs is None
+            and is_number(link.armature[0], 0.0)
+            and carries_nothing(link)
+        )
         return bare and any(law.bends for law in self.laws[link.dofs[0]])
 
     def _solve(self, gains: dict[int, Value]) -> dict[int, Value]:
@@ -178,10 +182,10 @@ class Step:
     def _guess(self, dof: int) -> Value:
         """Return the guess of u of a dof: u of the pass before, unless a law asked for another value.
 
-        A piece keeps its guess apart: it computes u anew in every pass, and until then its registers are free.
+        A segment keeps its guess apart: it computes u anew in every pass, and until then its registers are free.
         """
         apart = any(law.least is not None and law.most is not None for law in self.laws[dof])
-        apart = apart or self.trace.piece is not None
+        apart = apart or self.trace.segment is not None
         return self._kept_as(GUESS if apart else GAIN, dof)
 
     def _kept_as(self, name: str, dof: int) -> Value:
@@ -190,10 +194,11 @@ class Step:
     def _stores_of_pass(self, gains: dict[int, Value]) -> list[Store]:
         """Return the stores at the end of a pass; none for a whole tree without bounded laws.
 
-        A piece has few registers left in its pass, so it checks its guesses afterwards with inputs that it reads anew.
+        A segment has few registers left in its pass, so it checks its guesses afterwards with inputs that it reads
+        anew.
         """
         bends = any(law.bends for laws in self.laws.values() for law in laws)
-        if not bends and self.trace.piece is None:
+        if not bends and self.trace.segment is None:
             return []
         stores, missed, found = [], [], []
         turns: list[list[Store]] = []
@@ -202,7 +207,7 @@ class Step:
             for dof in link.dofs:
                 gain, laws, at = gains[dof], self.laws[dof], self._kept.get(dof, dof)
                 found.append(Store(GAIN, (at,), gain))
-                if self.trace.piece is None:
+                if self.trace.segment is None:
                     stores.append(found[-1])
                 else:
                     gain = self._kept_as(GAIN, dof)
@@ -219,13 +224,13 @@ class Step:
                     stores.append(Store(GUESS, (at,), select(self._waits(at), guess, after)))
                     turns[-1].append(stores[-1])
         stores += [Store(MISSED, (0,), total(missed))] if bends else []
-        if self.trace.piece is None:
+        if self.trace.segment is None:
             return stores
-        self.trace.checks = list(map(_turn, turns)) if self._in_turns else [stores]
+        self.trace.check_stores = list(map(_turn, turns)) if self._in_turns else [stores]
         return found
 
     def _waits(self, at: int) -> Value:
-        """Return non-zero in passes in which a dof, the ``at``-th of its piece, keeps its guess.
+        """Return non-zero in passes in which a dof, the ``at``-th of its segment, keeps its guess.
 
         Guesses that all change at once may repeat for ever, in cycles of four or five passes. Where a third of the dofs
         changes at a time, in turns, the cycles of all random states of G1 that were found ended.
@@ -242,51 +247,53 @@ class Step:
         known = self._inputs() + self.trace.links.lost_values()
         return select(all_finite(known), select(self._rank_loss(), Status.LOOPS, word), Status.NOT_FINITE)
 
-    def _words(self, own: Piece, results: list[Value]) -> list[Store]:
-        """Return the stores that send a piece's status to the first piece, which stores the most severe of all."""
+    def _words(self, own: Segment, results: list[Value]) -> list[Store]:
+        """Return the stores that send a segment's status to the first segment, which stores the most severe of all."""
         trace, graph = self.trace, self.trace.graph
         graph.step = "status|s"
         finite = select(all_finite(self._inputs()), select(all_finite(results), 0.0, Status.PIVOT), Status.NOT_FINITE)
         if own.index == 0:
             worst: Value = 0.0
-            for piece in Pieces(trace.links).pieces:
-                (word,) = trace.receive("S", piece)
+            for segment in Segments(trace.links).all:
+                (word,) = trace.receive("S", segment)
                 worst = select(less(worst, word), word, worst)
             word = self._verdict(worst)
-            values = trace.links.lost_values()  # here, because texts of pieces of equal structure are equal
+            values = trace.links.lost_values()  # here, because texts of segments of equal structure are equal
             word = select(all_finite(values), word, Status.NOT_FINITE) if values else word
-            trace.rounds = [[Store("status", (), word)]]
+            trace.final_stores = [[Store("status", (), word)]]
         return trace.send("S", own, [finite])
 
     def add_bodies(self) -> None:
-        """Let a piece store poses_out, velocities_out = body_poses, body_velocities of its bodies after the step.
+        """Let a segment store poses_out, velocities_out = body_poses, body_velocities of its bodies after the step.
 
-        It reads the state after the step from the pieces that its bodies move with.
+        It reads the state after the step from the segments that its bodies move with.
         """
-        trace, own = self.trace, self.trace.piece
+        trace, own = self.trace, self.trace.segment
         assert own is not None, "by whole trees, another kernel computes the states of bodies"
-        after = {(item.array, item.index[0]): item.value for item in trace.news if item.array in ("q_out", "out")}
-        trace.news = trace.news + trace.send("X", own, map(after.__getitem__, _entries(own)))
+        after = {
+            (item.array, item.index[0]): item.value for item in trace.final_messages if item.array in ("q_out", "out")
+        }
+        trace.final_messages = trace.final_messages + trace.send("X", own, map(after.__getitem__, _entries(own)))
         sent: dict[tuple[str, int], Value] = {}
-        for piece in Pieces(trace.links).pieces:
-            sent |= dict(zip(_entries(piece), trace.receive("X", piece), strict=True))
+        for segment in Segments(trace.links).all:
+            sent |= dict(zip(_entries(segment), trace.receive("X", segment), strict=True))
         moved = trace.at({"q": lambda c: sent["q_out", c], "qd": lambda dof: sent["out", dof]})
         found = [item._replace(array="poses_out") if item.array == "out" else item for item in body_states(moved)]
-        trace.rounds = [*trace.rounds, found]
+        trace.final_stores = [*trace.final_stores, found]
 
     def _verdict(self, worst: Value) -> Value:
-        """Return ``worst``, the most severe word of all pieces, or what the last pass adds where they are well."""
+        """Return ``worst``, the most severe word of all segments, or what the last pass adds where they are well."""
         settled = less(self.trace.graph.input(MISSED, 0), 0.5)
         return select(worst, worst, select(settled, 0.0, Status.NOT_SETTLED))
 
     def _inputs(self) -> list[Value]:
-        """Return all inputs of the piece's links; for the first piece also those of bodies that do not move."""
+        """Return all inputs of the segment's links; for the first segment also those of bodies that do not move."""
         trace, inputs = self.trace, [self.h]
         dofs = sorted(dof for link in self.links for dof in link.dofs)
         wide = ((link.coordinate, link.hinge.coordinates) for link in self.links)
         coordinates = sorted(first + c for first, count in wide for c in range(count))
-        own = {*map(id, trace.own_links)} | (set() if trace.piece and trace.piece.index else {id(None)})
-        bodies = sorted(body for body, seat in trace.links.seats.items() if id(seat.link) in own)
+        own = {*map(id, trace.own_links)} | (set() if trace.segment and trace.segment.index else {id(None)})
+        bodies = sorted(body for body, placement in trace.links.placements.items() if id(placement.link) in own)
         for name in trace.inputs:
             if name in ("q", "target_q", "q_from"):
                 inputs += map(trace.vector(name), coordinates)
@@ -305,14 +312,14 @@ class Step:
         return [number for number, moved in enumerate(own) if moved.intersection(dofs)]
 
 
-def _entries(piece: Piece) -> list[tuple[str, int]]:
-    """Return the arrays and indices of the entries of a piece in the state after a step."""
-    coordinates = [link.coordinate + c for link in piece.links for c in range(link.hinge.coordinates)]
-    return [*(("q_out", c) for c in coordinates), *(("out", dof) for dof in piece.dofs)]
+def _entries(segment: Segment) -> list[tuple[str, int]]:
+    """Return the arrays and indices of the entries of a segment in the state after a step."""
+    coordinates = [link.coordinate + c for link in segment.links for c in range(link.hinge.coordinates)]
+    return [*(("q_out", c) for c in coordinates), *(("out", dof) for dof in segment.dofs)]
 
 
-def by_pieces(scene: Scene) -> bool:
-    """Return whether pieces can share the work of a step: sweeps, not a matrix, serve its passes."""
+def by_segments(scene: Scene) -> bool:
+    """Return whether segments can share the work of a step: sweeps, not a matrix, serve its passes."""
     return scene.dof_count > SHORT
 
 
