@@ -34,7 +34,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.execution import plan
 from warp_spo.trials.inputs import OPERATIONS, Inputs
-from warp_spo.trials.trial import Subject, Trial
+from warp_spo.trials.trial import Subject, TrialRun
 from warp_spo.viewing import charts
 
 from .table import runner
@@ -112,7 +112,7 @@ def methods(scene: spo.Scene) -> dict[str, tuple[dict, int]]:
     if scene.dof_count <= plan.MOST_DOFS:
         found["tree"] = (dict(granularity="tree"), 0)
     found |= {f"scan {nodes}": (dict(recursion="scan"), nodes) for nodes in STRETCHES}
-    return found | {"plan": ({}, plan.STRETCH)}
+    return found | {"plan": ({}, plan.BLOCK_LENGTH)}
 
 
 COLUMNS = ("levels", "paths", "tree", *(f"scan {nodes}" for nodes in STRETCHES), "plan")
@@ -164,14 +164,14 @@ def measure(
 
 def trial_of(
     scene: spo.Scene, worlds: int, device: wp.Device, dtype: str, options: dict, nodes: int, inputs: list
-) -> tuple[Trial, spo.Dynamics]:
+) -> tuple[TrialRun, spo.Dynamics]:
     """Return a trial of forward dynamics with so many nodes in a stretch."""
-    default, plan.STRETCH = plan.STRETCH, nodes or plan.STRETCH
+    default, plan.BLOCK_LENGTH = plan.BLOCK_LENGTH, nodes or plan.BLOCK_LENGTH
     try:
         dyn = spo.Dynamics(scene, worlds, device, dtype, **options)
     finally:
-        plan.STRETCH = default
-    return Trial(Subject(dyn, inputs), FORWARD_DYNAMICS, min(SAMPLE, worlds)), dyn
+        plan.BLOCK_LENGTH = default
+    return TrialRun(Subject(dyn, inputs), FORWARD_DYNAMICS, min(SAMPLE, worlds)), dyn
 
 
 def print_parts(scene: spo.Scene, worlds: int, device: wp.Device, dtype: str, inputs: Inputs) -> None:

@@ -9,7 +9,7 @@ import warp_spo as spo
 from support import symbolic
 from support.contact_cases import box, quadruped
 from warp_spo.kernels import native
-from warp_spo.recursions.contact import contact_culling as crowds
+from warp_spo.recursions.contact import contact_culling
 from warp_spo.recursions.model import shared_constants
 
 SKIP = re.compile(r"if \(\w+ != 0\) \{")
@@ -85,8 +85,8 @@ def test_a_robot_that_is_thrown(monkeypatch, device, dtype):
 
 
 BUGS = {
-    "turning forgotten": (crowds.Crowd, "may_touch", "(v + self.reach * w)", "v"),
-    "points forgotten": (crowds, "gather", "one.depth for one in some", "one.depth for one in some[:1]"),
+    "turning forgotten": (contact_culling.CullGroup, "may_touch", "(v + self.reach * w)", "v"),
+    "points forgotten": (contact_culling, "group_points", "one.depth for one in some", "one.depth for one in some[:1]"),
 }
 
 

@@ -136,7 +136,7 @@ BUGS = {
     "how inertias count": (
         PassSolve,
         "_tell",
-        'trace.send("Q", segment, ways)',
+        'trace.send("Q", segment, gradients)',
         'trace.send("Q", segment, [0.0] * len(ways))',
     ),
     "how inertias count in memory": (

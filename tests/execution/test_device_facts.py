@@ -11,8 +11,7 @@ from support import zoo
 from warp_spo.dynamics.inertia import SOLVE_MASS_MATRIX
 from warp_spo.execution import device_facts, plan
 from warp_spo.execution.device_facts import CPU, MEASURED, DeviceFacts
-from warp_spo.kernels import native
-from warp_spo.kernels import straight_line as straight
+from warp_spo.kernels import native, straight_line
 
 L4 = DeviceFacts("NVIDIA L4", multiprocessors=58, shared_bytes=100 * 1024)
 RTX_4090 = DeviceFacts("NVIDIA GeForce RTX 4090", multiprocessors=128, shared_bytes=100 * 1024)
@@ -85,7 +84,7 @@ def test_rows_that_a_block_may_not_declare_are_asked_for(bodies, asked, monkeypa
     dyn.operators(np.zeros((2, bodies))).phi.apply(x)
     [(more, text)] = kernels
     assert bool(more["shared"]) == asked == ("extern __shared__" in text)
-    assert not asked or straight.SHARED_BYTES < more["shared"] <= 2 * straight.SHARED_BYTES
+    assert not asked or straight_line.SHARED_BYTES < more["shared"] <= 2 * straight_line.SHARED_BYTES
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ def scanned(device, monkeypatch):
     """Make a Dynamics that scans, with so many nodes in a block."""
 
     def make(scene, worlds, dtype="float64", length=1, **options):
-        monkeypatch.setattr(plan, "STRETCH", length)
+        monkeypatch.setattr(plan, "BLOCK_LENGTH", length)
         return spo.Dynamics(scene, worlds, device, dtype, recursion="scan", **options)
 
     return make

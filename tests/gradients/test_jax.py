@@ -141,9 +141,9 @@ def test_several_columns():
 
 def test_a_wrong_gradient_is_seen(monkeypatch):
     """The planted bug: gradients change places."""
-    pull = spo_jax.programs.Program._pull_back
+    pull = spo_jax.operations.JaxOperation._pull_back
     monkeypatch.setattr(
-        spo_jax.programs.Program, "_pull_back", lambda *a: (lambda x: (x[0], x[2], x[1], *x[3:]))(pull(*a))
+        spo_jax.operations.JaxOperation, "_pull_back", lambda *a: (lambda x: (x[0], x[2], x[1], *x[3:]))(pull(*a))
     )
     with pytest.raises(AssertionError):
         test_under_jit_and_grad("forward_dynamics")

@@ -9,15 +9,13 @@ from support.laws import TOLERANCE
 from support.mutants import mutant
 from support.routines import ROUTINES
 from warp_spo.execution.node import functions as node_functions
-from warp_spo.execution.node import sweeps as levels
+from warp_spo.execution.node import sweeps
 from warp_spo.execution.segment import shared_code, warp_specialized
 from warp_spo.graph import blocks
-from warp_spo.kernels import straight_line as straight
-from warp_spo.recursions import articulated, articulated_sweeps, newton_euler
-from warp_spo.recursions import mass_matrix_inverse as inverse
+from warp_spo.kernels import straight_line
+from warp_spo.recursions import articulated, articulated_sweeps, mass_matrix_inverse, newton_euler
 from warp_spo.recursions.model import links, messages, segments
-from warp_spo.trace import scalars as graph
-from warp_spo.trace import spatial
+from warp_spo.trace import scalars, spatial
 
 WORLDS = 3
 
@@ -57,7 +55,7 @@ def test_an_unwritten_output(plant, device):
     dyn, arrays = dynamics(device)
     laws.every_entry_is_written(dyn, "inverse_dynamics", arrays)
     plant(
-        levels,
+        sweeps,
         "newton_euler",
         "            tau_out[world, dof] = tau",
         "            if dof > 0:\n                tau_out[world, dof] = tau",
@@ -71,7 +69,7 @@ def test_worlds_that_leak_into_each_other(plant, device):
     dyn, arrays = dynamics(device)
     laws.worlds_do_not_touch_each_other(dyn, "inverse_dynamics", arrays)
     plant(
-        levels,
+        sweeps,
         "kinematics",
         "alpha = s.load_motion(acceleration_out, parent, world)",
         "alpha = s.load_motion(acceleration_out, parent, wp.max(world - 1, 0))",
@@ -86,7 +84,7 @@ def test_a_wrong_gyroscopic_sign(monkeypatch, device):
     dyn, arrays = dynamics(device, "screw_tree")
     laws.bias_force_is_christoffel(dyn, arrays, 1e-6)
     symbolic.plant(monkeypatch, newton_euler, "body_force", "+ cross(motion.spin", "- cross(motion.spin")
-    monkeypatch.setattr(levels, "node_functions", node_functions.NodeFunctions)
+    monkeypatch.setattr(sweeps, "node_functions", node_functions.NodeFunctions)
     dyn, arrays = dynamics(device, "screw_tree")
     laws.forward_undoes_inverse_dynamics(dyn, arrays, TOLERANCE["float64"])  # blind, as theory says
     with pytest.raises(AssertionError):
@@ -104,7 +102,7 @@ def test_a_missing_child(plant, file, operation, device):
     dyn, arrays = dynamics(device)
     laws.equals_reference(dyn, operation, arrays, TOLERANCE["float64"])
     old = "for c in range(topology.child_start[node], topology.child_start[node + 1]):"
-    plant(levels, file, old, old.replace("topology.child_start[node + 1]", "topology.child_start[node + 1] - 1"))
+    plant(sweeps, file, old, old.replace("topology.child_start[node + 1]", "topology.child_start[node + 1] - 1"))
     dyn, arrays = dynamics(device)
     with pytest.raises(AssertionError):
         laws.equals_reference(dyn, operation, arrays, TOLERANCE["float64"])
@@ -147,7 +145,7 @@ MUTANTS = {
     "mirror of a symmetric matrix": (links, "symmetric", "[xz, yz, zz]", "[yz, xz, zz]", "inverse_dynamics", ("qd",)),
     "turn the wrong way": (spatial.Pose, "to_child", "c * v[1] - s * v[0]", "c * v[1] + s * v[0]",
                            "inverse_dynamics", ("qdd",)),
-    "a sign lost in folding": (graph, "multiply", "!= (y.op", "and (y.op", "inverse_dynamics", ("qd", "qdd")),
+    "a sign lost in folding": (scalars, "multiply", "!= (y.op", "and (y.op", "inverse_dynamics", ("qd", "qdd")),
     "a pivot out of order": (articulated, "reduce_link", "given[::-1]", "given", "forward_dynamics", ("tau",)),
 }  # fmt: skip
 
@@ -164,7 +162,7 @@ def test_a_wrong_step(bug, monkeypatch):
 def team_error(monkeypatch, operation="forward_dynamics", name="star"):
     """Of the CUDA text of a scene's warps, against the dense reference; raises Race."""
     texts = warp_machine.recorded(monkeypatch)
-    monkeypatch.setattr(straight, "SHARED_BYTES", 1 << 20)
+    monkeypatch.setattr(straight_line, "SHARED_BYTES", 1 << 20)
     scene = zoo.SCENES[name]()
     dyn = spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity="segment")
     arrays = laws.states(scene, WORLDS)
@@ -205,8 +203,18 @@ def test_a_wrong_team(bug, monkeypatch):
 
 
 INVERSE_MUTANTS = {
-    "another column": (inverse.Inverse, "_meet", "sent[length * at : length * at + common]", "sent[:common]"),
-    "what lies further in": (inverse.Inverse, "_come_back", "[dot(row, force) for row in N]", "[0.0 for row in N]"),
+    "another column": (
+        mass_matrix_inverse.Inverse,
+        "_meet",
+        "sent[length * at : length * at + common]",
+        "sent[:common]",
+    ),
+    "what lies further in": (
+        mass_matrix_inverse.Inverse,
+        "_come_back",
+        "[dot(row, force) for row in N]",
+        "[0.0 for row in N]",
+    ),
     "parted too early": (
         segments.Segment,
         "common_ancestor",

@@ -13,7 +13,7 @@ from warp_spo.errors import UnsupportedError
 from warp_spo.examples import newton_grasp
 from warp_spo.newton import SolverSPO
 from warp_spo.newton.pairs import ModelPairs, warn_of_bodies_apart
-from warp_spo.newton.worlds import Worlds
+from warp_spo.newton.worlds import WorldRows
 
 
 @pytest.fixture(autouse=True)
@@ -64,7 +64,7 @@ def test_what_steps_cannot_do_has_a_name():
 
 def chosen(model, asked):
     """Return the labels of the pairs that a solver would take, without building it."""
-    pairs = ModelPairs(model, Worlds(model), spo.from_newton(model), asked)
+    pairs = ModelPairs(model, WorldRows(model), spo.from_newton(model), asked)
     return [contact.label for contact in pairs._contacts], pairs
 
 
@@ -86,12 +86,12 @@ def test_bodies_that_pass_through_each_other_are_a_warning(recwarn):
     """Only where no joint connects them; parts of one robot may be meant to pass through each other."""
     model = many(arm())
     with pytest.warns(UserWarning, match=r"such as capsule '.*stick' of body 'upper' with box '.*box of cube' of body"):
-        warn_of_bodies_apart(model, Worlds(model), spo.from_newton(model))
+        warn_of_bodies_apart(model, WorldRows(model), spo.from_newton(model))
     panda, _ = newton_grasp.panda()
     for pad in range(2):  # pads with each other may collide
         panda.add_shape_collision_filter_pair(pad, 2)
     model = many(panda, 1)
-    warn_of_bodies_apart(model, Worlds(model), spo.from_newton(model))
+    warn_of_bodies_apart(model, WorldRows(model), spo.from_newton(model))
     assert not recwarn.list
 
 

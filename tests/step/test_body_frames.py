@@ -46,7 +46,7 @@ def scene_of(name):
 def test_equal_those_of_statements(name, variable, device):
     """With centres of mass that differ between worlds; nobody reads what the arrays held before."""
     scene = scene_of(name)
-    assert body_frames.suits(Links(scene, variable))
+    assert body_frames.is_supported(Links(scene, variable))
     dyn = spo.Dynamics(scene, WORLDS, device=device, dtype="float64", granularity="segment", variable=variable)
     alone = spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity="tree", variable=variable)
     if "body_com" in variable:
@@ -68,13 +68,13 @@ def test_warps_take_several_walks(monkeypatch, device):
 
 
 def test_a_scene_with_a_body_that_does_not_move():
-    assert not body_frames.suits(Links(zoo.SCENES["one_fixed_then_revolute"]()))
+    assert not body_frames.is_supported(Links(zoo.SCENES["one_fixed_then_revolute"]()))
 
 
 def test_values_that_vary():
     """Anchors, and centres of mass in bodies whose frames are not those of their hinges."""
-    assert not body_frames.suits(Links(scene_of("walker"), ("joint_X_p",)))
-    assert not body_frames.suits(Links(scene_of("fork"), ("body_com",)))
+    assert not body_frames.is_supported(Links(scene_of("walker"), ("joint_X_p",)))
+    assert not body_frames.is_supported(Links(scene_of("fork"), ("body_com",)))
 
 
 @pytest.mark.slow

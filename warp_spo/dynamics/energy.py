@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ..errors import UnsupportedError
-from ..execution.node import operations as nodes
+from ..execution.node import operations as node_operations
 from ..execution.routine import Routine
 from ..recursions import energy as recursion
 from ..recursions.derivatives import adjoints
@@ -23,7 +23,7 @@ KINETIC_ENERGY = Operation(
     "kinetic_energy",
     arguments=(Q, required(QD)),
     results=(Result("energy", "world"),),
-    routine=Routine("kinetic_energy", recursion.kinetic_energy, nodes.kinetic_energy),
+    routine=Routine("kinetic_energy", recursion.kinetic_energy, node_operations.kinetic_energy),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,
     derivative=Derivative(

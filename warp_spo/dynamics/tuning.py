@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from ..errors import UnsupportedError, as_names
-from ..execution import tuned as files
+from ..execution import tuned
 from ..execution.plan import choose
 from ..execution.routine import Routine
 from ..execution.tuned import Tuned
@@ -79,7 +79,7 @@ def tune(self: Dynamics, operations: Sequence[str] | None = None) -> dict[str, T
             known = ", ".join(name for name, one in self._operations.items() if one.routine and not one.product)
             raise ValueError(f"Dynamics.tune: operations names {name!r}; expected some of {known}")
         try:
-            with self.recursions.turn.lock:  # calls of other threads would be timed, too
+            with self.recursions.call_order.lock:  # calls of other threads would be timed, too
                 found[name] = _tune_one(self, operation)
         except UnsupportedError:
             if operations is not None:
@@ -112,7 +112,7 @@ def _tune_recursion(dyn: Dynamics) -> dict[str, Tuned]:
         return {}
     if len(block_lengths) == 1:
         return {}
-    with dyn.recursions.turn.lock:
+    with dyn.recursions.call_order.lock:
         return {RECURSION: _choose(dyn, RECURSION, tuple(block_lengths), lambda: _measure_recursion(dyn, operation))}
 
 
@@ -121,13 +121,13 @@ def _choose(dyn: Dynamics, name: str, candidates: Sequence[str], measure: Callab
     if name in dyn.plan.tuned:
         return dyn.plan.tuned[name]
     key = _key(dyn, name)
-    choice = files.read(key, candidates)
+    choice = tuned.read(key, candidates)
     if choice is None:
         us = measure()
-        best = files.choice_of(us, candidates[0])
+        best = tuned.choice_of(us, candidates[0])
         now = Tuned(best, us, dyn.plan.device.name, f"{datetime.date.today()}", measured=True)
-        choice = files.read(key, candidates, warn=False)  # another process may have been faster
-        choice = files.write(key, now) if choice is None else choice
+        choice = tuned.read(key, candidates, warn=False)  # another process may have been faster
+        choice = tuned.write(key, now) if choice is None else choice
     use(dyn, name, choice)
     return choice
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..kernels import straight_line as straight
+from ..kernels import straight_line
 from ..kernels.straight_line import DIRECT, RELAYED, TILED, KernelLayout
 from ..kernels.substeps import SUBSTEPS
 from ..recursions.contact import coupled
@@ -65,7 +65,7 @@ def make_emitter(
         if array in LOOPED and segments:
             return f"{'if (open) ' if array == GUESS else ''}{load(array, entry)} = {value};"
         if array == "out" and result.way == TILED:
-            return f"if (mine) result_row[({entry}) * {straight.TILE}] = {value};"
+            return f"if (mine) result_row[({entry}) * {straight_line.TILE}] = {value};"
         if layout.repeats and array == "status":
             return f"if (mine) {{ const int word = {value}; if ({_IS_WORSE}) status_row[0] = word; }}"
         if layout.repeats and array == "contact_f":  # the mean over substeps

@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from ..kernels import coupling, native
-from ..kernels import straight_line as straight
+from ..kernels import coupling, native, straight_line
 from ..kernels.fields import axes
 from ..kernels.native import INTEGERS
 from ..kernels.straight_line import BY_TABLE, TILED, KernelLayout
@@ -140,11 +139,11 @@ class Builder:
         ``wide``: for long rows that all go through it. ``couples``: for what segments couple in it. ``whole``: all that
         a multiprocessor has.
         """
-        more = straight.COUPLED_BYTES if couples else straight.WIDE_BYTES if wide else 0
-        wanted = max(straight.SHARED_BYTES, more) * wp.types.type_size_in_bytes(self.run.dtype) // 4
+        more = straight_line.COUPLED_BYTES if couples else straight_line.WIDE_BYTES if wide else 0
+        wanted = max(straight_line.SHARED_BYTES, more) * wp.types.type_size_in_bytes(self.run.dtype) // 4
         allowed = self.plan.device.shared_bytes - 3 * RESERVED  # Warp takes a share, too
         wanted = max(wanted, allowed) if whole else wanted
-        return min(wanted, max(allowed, straight.SHARED_BYTES)) if self.plan.device.cuda else wanted
+        return min(wanted, max(allowed, straight_line.SHARED_BYTES)) if self.plan.device.cuda else wanted
 
     def height_tables(self, reads: bool) -> dict[str, Any]:
         """Return the table of the ground's cells, if a program ``reads`` it."""
@@ -176,7 +175,7 @@ class Builder:
             operations: of one world.
             registers: of a thread at most; None: as the compiler chooses.
         """
-        text = straight.assemble(layout, cuda, cpu, self.run.dtype)
+        text = straight_line.assemble(layout, cuda, cpu, self.run.dtype)
         rows, fields = (*(row.name for row in layout.rows), *layout.numbers), tuple(layout.fields)
         arrays = [(row.name, row.ndim) for row in layout.rows] + [(name, 0) for name in layout.numbers]
         arrays += [(name, axes(name)) for name in fields]

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..trace.scalars import Value, absolute, guarded, is_constant, quotient, reciprocal
 from ..trace.spatial import IDENTITY, ZERO, Articulated, Pose, Rigid, Vector, cross, dot, magnitude, symmetric, total
-from .model.links import Link, Placed
+from .model.links import Link, LinkPlacement
 from .motion import NONE, VelocityTerms, carry_acceleration, hinge_entries, hinge_motion
 
 LEAST = 4.0  # roundings of the terms that cancel in a pivot; a smaller pivot may be rounding alone
@@ -71,7 +71,7 @@ class LinkFactor:
 
 def factor(
     link: Link,
-    place: Placed,
+    place: LinkPlacement,
     carried_on: list[Articulated],
     through: list[tuple[Pose, Articulated]],
     epsilon: float,
@@ -134,7 +134,7 @@ def eliminate_units(
     return pivots, P
 
 
-def columns(link: Link, place: Placed) -> list[Vector]:
+def columns(link: Link, place: LinkPlacement) -> list[Vector]:
     """Return the columns of H*, (omega; v) in the link's axes."""
     found = []
     for dof in link.dofs:
@@ -249,7 +249,7 @@ def cancellation(coupling: Value, share: Value, size: Value) -> Value:
 
 
 def reduce_link(
-    link: Link, place: Placed, done: LinkFactor, motion: VelocityTerms, force: Vector, tau: Any
+    link: Link, place: LinkPlacement, done: LinkFactor, motion: VelocityTerms, force: Vector, tau: Any
 ) -> tuple[list[Value], Vector]:
     """Return D^-1 eps of each pivot, and z+ in the parent's frame; ``force`` is z: (n; f) in the link's frame."""
     if done.in_hinge is not None:
@@ -280,7 +280,7 @@ def expand_pivot(pivot: Pivot, alpha: Sequence[Value], rate: Value) -> tuple[Val
     return qdd, [a + qdd if i == pivot.unit else a for i, a in enumerate(alpha)]
 
 
-def force_on_parent(link: Link, place: Placed, done: LinkFactor, motion: VelocityTerms, z: Vector) -> Vector:
+def force_on_parent(link: Link, place: LinkPlacement, done: LinkFactor, motion: VelocityTerms, z: Vector) -> Vector:
     """Return z+ of a link with its bias added, in the parent's frame; zero at a root."""
     if link.parent is None:
         return ZERO
@@ -296,7 +296,7 @@ def force_on_parent(link: Link, place: Placed, done: LinkFactor, motion: Velocit
 
 def expand_link(
     link: Link,
-    place: Placed,
+    place: LinkPlacement,
     done: LinkFactor,
     rates: list[Value],
     motion: VelocityTerms,
@@ -324,7 +324,7 @@ def expand_link(
     return qdd, (w, v)
 
 
-def _reduce_root(place: Placed, pivots: list[Pivot], force: Vector, tau: Any) -> list[Value]:
+def _reduce_root(place: LinkPlacement, pivots: list[Pivot], force: Vector, tau: Any) -> list[Value]:
     """Return D^-1 eps of each pivot of a root with pivots in its hinge's axes, which leaves nothing for a parent."""
     pose, eps = Pose(None, place.turned, ZERO), []
     z = Vector((*pose.to_parent(force[:3]), *pose.to_parent(force[3:])))
@@ -336,7 +336,7 @@ def _reduce_root(place: Placed, pivots: list[Pivot], force: Vector, tau: Any) ->
 
 def _expand_root(
     link: Link,
-    place: Placed,
+    place: LinkPlacement,
     pivots: list[Pivot],
     rates: list[Value],
     motion: VelocityTerms,

@@ -8,7 +8,7 @@ from ..trace.emission import Store
 from ..trace.spatial import ZERO, Vector, dot
 from .kinematics import link_velocities, place_all
 from .momentum import composite_inertias
-from .step.joint_laws import Impedance
+from .step.joint_laws import JointLaws
 
 if TYPE_CHECKING:
     from .model.tracing import Trace
@@ -41,7 +41,7 @@ def potential_energy(trace: Trace) -> list[Store]:
             body, key = bodies[id(link)], id(link)
             moment = moment + trace.axes[key] @ body.moment + (origins[key] + first) * body.mass
     springs, energy = (
-        Impedance(trace.links, 0.0, trace.vector("q"), trace.vector("qd")),
+        JointLaws(trace.links, 0.0, trace.vector("q"), trace.vector("qd")),
         -dot(trace.links.gravity, moment),
     )
     for link in trace.links.leaders:

@@ -16,7 +16,7 @@ from . import articulated, newton_euler
 from .articulated import LEAST, NO_INERTIA, LinkFactor, Pivot
 from .articulated_sweeps import NO_FORCE, Factors, inside, total_inertia
 from .model import shared_dofs
-from .model.links import Link, Placed
+from .model.links import Link, LinkPlacement
 from .motion import VelocityTerms, carry_acceleration
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class Given(NamedTuple):
 
 def factor(
     link: Link,
-    place: Placed,
+    place: LinkPlacement,
     mask: list[Value],
     carried_on: list[Articulated],
     through: list[tuple[Pose, Articulated]],
@@ -78,7 +78,7 @@ def factor(
 
 
 def reduce_link(
-    link: Link, place: Placed, done: LinkFactor, motion: VelocityTerms, force: Vector, given: Given
+    link: Link, place: LinkPlacement, done: LinkFactor, motion: VelocityTerms, force: Vector, given: Given
 ) -> tuple[list[Value], list[Value], Vector]:
     """Of each pivot D^-1 (tau - H z), or qdd if it is prescribed; H z; and z+ in the parent's frame."""
     rates, forces_at_rest, z = [], [], force
@@ -91,7 +91,7 @@ def reduce_link(
 
 def expand_link(
     link: Link,
-    place: Placed,
+    place: LinkPlacement,
     done: LinkFactor,
     rates: list[Value],
     forces_at_rest: list[Value],

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from ..trace.scalars import Value
 from ..trace.spatial import ZERO, Matrix, Pose, Vector, cross, symmetric
-from .model.links import Link, Placed
+from .model.links import Link, LinkPlacement
 
 NONE = Matrix.of([[0.0] * 3] * 3)
 
@@ -41,22 +41,22 @@ def whirl(w: Vector) -> Matrix:
     return symmetric(-(yy + zz), -(xx + zz), -(xx + yy), w[0] * w[1], w[0] * w[2], w[1] * w[2])
 
 
-def hinge_motion(link: Link, place: Placed, rate: Any) -> tuple[Vector, Vector]:
+def hinge_motion(link: Link, place: LinkPlacement, rate: Any) -> tuple[Vector, Vector]:
     """Return H* rate, (omega; v) of the hinge in the link's axes, for ``rate(dof)``."""
     return link.hinge.velocity(place, [rate(dof) for dof in link.dofs])
 
 
-def hinge_entries(link: Link, place: Placed, w: Vector, v: Vector) -> list[Value]:
+def hinge_entries(link: Link, place: LinkPlacement, w: Vector, v: Vector) -> list[Value]:
     """Return H (w; v), for (n; f) or (omega'; v') of the link: an entry for each of the link's dofs."""
     return link.hinge.forces(place, w, v)
 
 
-def own_bias(link: Link, place: Placed, qd: Any) -> tuple[Vector, Vector] | None:
+def own_bias(link: Link, place: LinkPlacement, qd: Any) -> tuple[Vector, Vector] | None:
     """Return (d H* / dt) qd in the link's axes; None where H is constant in the link or in its parent."""
     return link.hinge.own_bias(place, [qd(dof) for dof in link.dofs])
 
 
-def link_motion(link: Link, place: Placed, parent: VelocityTerms | None, qd: Any) -> VelocityTerms:
+def link_motion(link: Link, place: LinkPlacement, parent: VelocityTerms | None, qd: Any) -> VelocityTerms:
     """Return the motion of ``link`` at rates ``qd(dof)`` on a parent that moves as ``parent``; None is at rest."""
     if qd is None:
         return STILL
@@ -73,7 +73,7 @@ def compose_motions(pose: Pose, parent: VelocityTerms, w: Vector, v: Vector) -> 
 
 
 def carry_acceleration(
-    place: Placed, motion: VelocityTerms, acceleration: tuple[Vector, Vector]
+    place: LinkPlacement, motion: VelocityTerms, acceleration: tuple[Vector, Vector]
 ) -> tuple[Vector, Vector]:
     """Return the link's acceleration from that of its parent, without its own bias and qdd."""
     w, v = acceleration

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Rigid, Vector, cross, skew
-from .model.links import Link, Placed
+from .model.links import Link, LinkPlacement
 from .motion import VelocityTerms, armature_forces, carry_acceleration, hinge_entries, hinge_motion
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def link_acceleration(
-    link: Link, place: Placed, motion: VelocityTerms, acceleration: tuple[Vector, Vector], qdd: Any
+    link: Link, place: LinkPlacement, motion: VelocityTerms, acceleration: tuple[Vector, Vector], qdd: Any
 ) -> tuple[Vector, Vector]:
     """Return the acceleration of the link for that of its parent and ``qdd(dof)``."""
     if link.hinge.unconstrained and link.parent is None:
@@ -72,14 +72,21 @@ def add_wrenches(axes: Matrix, acting: list[tuple[Vector, Vector, Vector]]) -> t
     return axes.T @ torque + moment, axes.T @ force
 
 
-def hinge_force(link: Link, place: Placed, n: Vector, f: Vector, qdd: Any) -> list[Value]:
+def hinge_force(link: Link, place: LinkPlacement, n: Vector, f: Vector, qdd: Any) -> list[Value]:
     """Return tau of the link's dofs for the force (n; f) that its hinge transmits."""
     forces = hinge_entries(link, place, n, f)
     return [force + own for force, own in zip(forces, armature_forces(link, qdd), strict=True)]
 
 
 def root_force(
-    link: Link, place: Placed, n: Vector, f: Vector, mass: float, v: Vector, base: tuple[Vector, Vector], qdd: Any
+    link: Link,
+    place: LinkPlacement,
+    n: Vector,
+    f: Vector,
+    mass: float,
+    v: Vector,
+    base: tuple[Vector, Vector],
+    qdd: Any,
 ) -> list[Value]:
     """The same for a free link on the inertial frame that carries ``mass``, itself included, and accelerates with v.
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from ..hinges.deflection import Deflection
 from ..hinges.quaternions import matrix_quaternion
-from ..hinges.rotor_axis import Spin
+from ..hinges.rotor_axis import RotorAxis
 from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Pose, Rigid, Vector, cross, dot
@@ -74,7 +74,7 @@ def node_blocks(trace: Trace) -> list[Store]:
 
 def _hinge_links(trace: Trace, node: int) -> list[Link]:
     """Return the links of a body's own hinge, inboard first."""
-    return [x for x in trace.links.links if x.node == node and not isinstance(x.hinge, Deflection | Spin)]
+    return [x for x in trace.links.links if x.node == node and not isinstance(x.hinge, Deflection | RotorAxis)]
 
 
 def _modes(trace: Trace, node: int) -> int:

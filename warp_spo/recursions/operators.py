@@ -15,7 +15,7 @@ from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Articulated, Pose, Vector, cross, dot
 from . import articulated
 from .expressions import NODES, Expression, spaces
-from .model.links import Link, Placed, place_link
+from .model.links import Link, LinkPlacement, place_link
 from .motion import hinge_entries, hinge_motion
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ class Operators:
         for link in self.links.links:
             self.chains[link.node].append(link)
         self._hops: dict[int, list[tuple[Link | None, Pose]]] = {}
-        self._places: dict[int, Placed] = {}
+        self._places: dict[int, LinkPlacement] = {}
         self._factors: dict[int, articulated.LinkFactor] = {}
         self._inertias: dict[int, Articulated] = {}
 
@@ -350,7 +350,7 @@ class Operators:
         return self._inertias[top]
 
     # -- what is shared --------------------------------------------------------------------------------------------
-    def place(self, link: Link) -> Placed:
+    def place(self, link: Link) -> LinkPlacement:
         """Return the placement of a link."""
         if id(link) not in self._places:
             self.graph.step = f"{link.title}|x"

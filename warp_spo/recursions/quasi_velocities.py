@@ -20,7 +20,7 @@ from .model import shared_dofs
 from .motion import carry_acceleration, link_motion
 
 if TYPE_CHECKING:
-    from .model.links import Link, Placed
+    from .model.links import Link, LinkPlacement
     from .model.tracing import Trace
 
 Entry = Callable[[int], Value]
@@ -38,7 +38,7 @@ def factor_by_dofs(trace: Trace) -> Factors:
     return done
 
 
-def _factor(link: Link, place: Placed, *carried: Any) -> articulated.LinkFactor:
+def _factor(link: Link, place: LinkPlacement, *carried: Any) -> articulated.LinkFactor:
     return hybrid.factor(link, place, [0.0] * len(link.dofs), *carried)
 
 

@@ -32,8 +32,7 @@ from ...recursions.derivatives.contact_pass import (
 from ...recursions.model.messages import SIZES
 from ...recursions.model.tracing import Trace
 from ...scene.contacts import HEIGHTS, HeightField
-from . import midpoint_contact as rounds
-from . import midpoint_contact_gradients as rounds_back
+from . import midpoint_contact, midpoint_contact_gradients
 
 if TYPE_CHECKING:
     from ..dynamics import Dynamics
@@ -70,8 +69,8 @@ def launch(
     count = PASSES if passes is None else passes
     given = {name: value for name, value in given.items() if value is not None}
     results = dict(zip(wrt, (out, *more.values()), strict=True))
-    if rounds.in_rounds(dyn.scene, count):
-        rounds_back.pull_back(dyn, functools.partial(_launch, dyn), results, count, **given)
+    if midpoint_contact.uses_midpoint(dyn.scene, count):
+        midpoint_contact_gradients.backpropagate(dyn, functools.partial(_launch, dyn), results, count, **given)
     else:
         _launch(dyn, results, count, **given)
 

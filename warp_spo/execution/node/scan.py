@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from ...graph.blocks import new_weights
-from ...graph.doubling import Doubling, Round
+from ...graph.doubling import Doubling, DoublingRound
 from ...kernels import declare, scan_articulated, scan_forces, scan_motion, scan_solve
 from ...kernels.spatial import ARTICULATED, MOTION, POSE
 from ...kernels.topology import PathBlocks
@@ -67,7 +67,7 @@ class Scan:
         return self._weights_and_resolvent()
 
     @property
-    def _rounds(self) -> list[Round]:
+    def _rounds(self) -> list[DoublingRound]:
         """The rounds along the tree of blocks; none if no block hangs on another one."""
         return self._through_psi[0].rounds
 

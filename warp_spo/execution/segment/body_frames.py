@@ -11,8 +11,8 @@ import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
-from ...hinges.quaternions import Quaternion, constant_quaternion, multiplied, turned
-from ...hinges.revolute import Turn
+from ...hinges.quaternions import Quaternion, constant_quaternion, multiply, turned
+from ...hinges.revolute import Revolute
 from ...recursions.kinematics import NEUTRAL, quaternions_in_links, relative_quaternion
 from ...recursions.model.links import Link, Links, place_link
 from ...recursions.model.scene_cache import cached_by_scene
@@ -138,14 +138,14 @@ def _in_frame(links: Links, link: Link, offset: Vector, turn: Quaternion) -> tup
         return offset, turn
     node = links.placements[link.node]
     x, y, z, w = constant_quaternion(node.matrix)
-    return node.matrix.T @ (offset - node.offset), multiplied(Vector((-x, -y, -z, w)), turn)
+    return node.matrix.T @ (offset - node.offset), multiply(Vector((-x, -y, -z, w)), turn)
 
 
 def move_to_link(links: Links, number: int) -> list[Store]:
     """Return the stores of a step of a traversal to a link; equal for all links that turn about an axis on another
     one."""
     link, over = links.links[number], TraversalFrame(ZERO, NEUTRAL, ZERO, ZERO)
-    if link.parent is not None and link.hinge.shape == Turn.name:
+    if link.parent is not None and link.hinge.shape == Revolute.name:
         graph, first = Graph(), RECORD * len(links.placements) + PLACE * number
         table = [graph.input(GEOMETRY, first + i) for i in range(PLACE)]
         still = dataclasses.replace(link, matrix=None, offset=Vector(table[:3]), rest=Vector(table[3:]))
@@ -158,7 +158,7 @@ def move_to_link(links: Links, number: int) -> list[Store]:
     frame = _frame_of_child(over, still, lambda c: graph.input("q", c), lambda dof: graph.input("qd", dof))
     if _at_node(link):
         placement = links.placements[link.node]
-        arm, Q = turned(frame.Q, placement.offset), multiplied(frame.Q, constant_quaternion(placement.matrix))
+        arm, Q = turned(frame.Q, placement.offset), multiply(frame.Q, constant_quaternion(placement.matrix))
         frame = TraversalFrame(frame.p + arm, Q, frame.w, frame.v + cross(frame.w, arm))
     return [Store(FRAME, (i,), x) for i, x in enumerate(x for part in frame for x in part)]
 
@@ -174,7 +174,7 @@ def _frame_of_child(
 ) -> TraversalFrame:
     """Return the frame of a link for that of its parent, at q and qd."""
     place = place_link(link, q)
-    arm, Q = turned(over.Q, place.pose.l), multiplied(over.Q, relative_quaternion(link, q))
+    arm, Q = turned(over.Q, place.pose.l), multiply(over.Q, relative_quaternion(link, q))
     w, v = over.w, over.v + cross(over.w, arm)
     columns = link.hinge.inertial_columns(link, place, _axes(over.Q), _axes(Q), ZERO)
     for dof, (turn, shift) in zip(link.dofs, columns, strict=True):
@@ -200,7 +200,7 @@ def store_body(links: Links, body: int) -> list[Store]:
     p, Q, w, v = _read(graph)
     number = [graph.input(GEOMETRY, RECORD * body + i) for i in range(RECORD)]
     com = [graph.input(*x.args) if not is_constant(x) else number[7 + i] for i, x in enumerate(links.nodes[body].com)]
-    offset, turn = turned(Q, Vector(number[:3])), multiplied(Q, Vector(number[3:7]))
+    offset, turn = turned(Q, Vector(number[:3])), multiply(Q, Vector(number[3:7]))
     arm = offset + turned(turn, Vector(com))
     pose, twist = (*(p + offset), *turn), (*(v + cross(w, arm)), *w)
     return [

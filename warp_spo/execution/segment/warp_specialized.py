@@ -235,7 +235,7 @@ class WarpSpecializedKernel:
         if self.pairs:
             text += [BARRIER, begin_pairs("warp", self.segments.warps)]
             a_pass = "\n".join([a_pass, BARRIER, judge_pairs("warp", self.segments.warps)])
-        if self._in_turns:
+        if self._laws_in_loops:
             a_pass = "\n".join(
                 [
                     self._turns_in_loops(leaves, ranks_by_name, "laws"),
@@ -261,7 +261,7 @@ class WarpSpecializedKernel:
         return "\n".join(text)
 
     @property
-    def _in_turns(self) -> bool:
+    def _laws_in_loops(self) -> bool:
         """Whether laws are found, and passes checked, in turns."""
         return any(work.laws for work in self._work.values())
 
@@ -347,7 +347,9 @@ class WarpSpecializedKernel:
 
     def _shared_sweeps(self, equal: Sequence[SegmentCode], prefix: str = "") -> tuple[str, str]:
         """Return one text for the inward and one for the outward sweeps of segments of equal structure."""
-        checks = [] if self._in_turns else [list(each) for each in zip(*(work.checks for work in equal), strict=True)]
+        checks = (
+            [] if self._laws_in_loops else [list(each) for each in zip(*(work.checks for work in equal), strict=True)]
+        )
         regions = [[work.inward for work in equal], [work.outward for work in equal], *checks]
         regions += [list(each) for each in zip(*(work.couples for work in equal), strict=True)]
         who = choose(_warps(equal), range(len(equal)))

@@ -24,7 +24,7 @@ from ..articulated import NO_INERTIA
 from ..articulated_sweeps import NO_FORCE, Factors, eliminate
 from ..model.links import Link
 from ..motion import STILL, carry_acceleration, hinge_entries, hinge_motion
-from .ties import Aggregate, Plan, key
+from .ties import Aggregate, TiePlan, key
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace
@@ -63,7 +63,7 @@ class Node:
         seats: where its links are, by id. ties: its couples.
     """
 
-    def __init__(self, trace: Trace, plan: Plan, aggregate: Aggregate, mask: Value, seats: Seats, ties: list[Tie]):
+    def __init__(self, trace: Trace, plan: TiePlan, aggregate: Aggregate, mask: Value, seats: Seats, ties: list[Tie]):
         self.trace, self.plan, self.aggregate, self.mask, self.seats = trace, plan, aggregate, mask, seats
         self.ties = ties
         self.dofs = [(id(link), i) for link in aggregate.links for i in range(len(link.dofs))]
@@ -261,7 +261,7 @@ def force_to_parent(pose: Pose, z: Vector) -> Vector:
     return Vector((*n, *f))
 
 
-def reduce(trace: Trace, plan: Plan, nodes: dict[int, Node], tau: Callable[[int], Value]) -> tuple[Factors, dict]:
+def reduce(trace: Trace, plan: TiePlan, nodes: dict[int, Node], tau: Callable[[int], Value]) -> tuple[Factors, dict]:
     """Sweep inward; ``nodes`` by id of the first link of each aggregate. Return factors and D^-1 eps, by link."""
     done: Factors = {}
     rates: dict[int, list[Value]] = {}
@@ -289,7 +289,7 @@ def reduce(trace: Trace, plan: Plan, nodes: dict[int, Node], tau: Callable[[int]
     return done, rates
 
 
-def expand(trace: Trace, plan: Plan, nodes: dict[int, Node], done: Factors, rates: dict, alpha: dict) -> list[Store]:
+def expand(trace: Trace, plan: TiePlan, nodes: dict[int, Node], done: Factors, rates: dict, alpha: dict) -> list[Store]:
     """Sweep outward; ``alpha`` receives the accelerations of links. Return the stores of qdd."""
     stores: list[Store] = []
     found: dict[int, tuple[list[Value], tuple[Vector, Vector]]] = {}
@@ -315,7 +315,9 @@ def expand(trace: Trace, plan: Plan, nodes: dict[int, Node], done: Factors, rate
     return stores
 
 
-def seats_of(trace: Trace, plan: Plan, aggregate: Aggregate, frames: dict[int | None, tuple[Matrix, Vector]]) -> Seats:
+def seats_of(
+    trace: Trace, plan: TiePlan, aggregate: Aggregate, frames: dict[int | None, tuple[Matrix, Vector]]
+) -> Seats:
     """Return where the links of an aggregate are, for inertial axes and origins of bodies that fly and of links."""
     R, o = frames[key(aggregate.base)] if key(aggregate.base) in frames else (IDENTITY, ZERO)
     found: dict[int | None, Seat] = {key(aggregate.base): Seat(IDENTITY, ZERO)}

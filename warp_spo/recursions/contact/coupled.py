@@ -18,9 +18,9 @@ from ..model.links import Link, Links
 from . import aggregates
 from .aggregates import LAST, Node, Seat, Seats, Tie, add
 from .pairs import RESIDUAL, place_axes_of, values_of, velocities_of
-from .points import Point, with_ancestors
-from .step import ContactStep, Touch
-from .ties import Couple, Plan, couples_of, flies, key
+from .points import TracedContactPoint, with_ancestors
+from .step import ContactStepTrace, PointState
+from .ties import Couple, TiePlan, couples_of, flies, key
 
 if TYPE_CHECKING:
     pass
@@ -43,10 +43,10 @@ def suits(links: Links) -> bool:
              for p in links.scene.contact_pairs)  # fmt: skip
     if any(link.shared_dofs is not None for link in links.links) or not all(map(any, pairs)):
         return False
-    return Plan(links, couples_of(links)).work <= MOST_WORK
+    return TiePlan(links, couples_of(links)).work <= MOST_WORK
 
 
-class CoupledStep(ContactStep):
+class CoupledStep(ContactStepTrace):
     """One time step with contacts of bodies with each other, too, as a trace; arguments as those of ContactStep."""
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
@@ -65,10 +65,10 @@ class CoupledStep(ContactStep):
         """Return the stores of qdd; ``alpha`` receives the accelerations of links by id."""
         return aggregates.expand(self.trace, self.plan, self.nodes, done, rates, alpha)
 
-    def _press(self, points: list[Point], touches: list[Touch]) -> None:
-        super()._press(points, touches)
+    def _press(self, points: list[TracedContactPoint], states: list[PointState]) -> None:
+        super()._press(points, states)
         trace = self.trace
-        self.plan = Plan(trace.links, couples_of(trace.links), lambda link: flies(self._with_resistance(link)))
+        self.plan = TiePlan(trace.links, couples_of(trace.links), lambda link: flies(self._with_resistance(link)))
         self.couples = self.plan.couples
         passes = trace.graph.input("passes", 0)  # native code counts them, too
         self.first += [Store(VALUE, (i,), value) for i, value in enumerate([*values_of(self), passes])]

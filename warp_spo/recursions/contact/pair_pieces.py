@@ -36,8 +36,8 @@ from .pairs import (
     values_of,
     velocities_of,
 )
-from .points import Point
-from .step import ContactStep, Touch
+from .points import TracedContactPoint
+from .step import ContactStepTrace, PointState
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace
@@ -104,10 +104,10 @@ def team(links: Links, segments: Segments, alpha: int, first: int) -> Team:
     return Team(couples_of(links), points, eps, weights, limbs, warps, dofs, seated, alpha, first, solids)
 
 
-class PairedSegment(ContactStep):
+class PairedSegment(ContactStepTrace):
     """The part of one segment in a step with pairs; arguments as those of ContactStep."""
 
-    looks = False
+    culls = False
 
     def __init__(self, trace: Trace, reports: tuple[str, ...]):
         super().__init__(trace, reports)
@@ -129,8 +129,8 @@ class PairedSegment(ContactStep):
         return found + self.twists
 
     # -- before the passes -----------------------------------------------------------------------------------------
-    def _press(self, points: list[Point], touches: list[Touch]) -> None:
-        super()._press(points, touches)
+    def _press(self, points: list[TracedContactPoint], states: list[PointState]) -> None:
+        super()._press(points, states)
         trace = self.trace
         assert trace.segment is not None
         self.frames = tuple((body, (0.0, 0.0, 0.0)) for body in self.own.values())

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ...scene.pairs import ROUND
+from ...scene.pairs import SWEPT_SEGMENT
 from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Value, sqrt
@@ -118,7 +118,8 @@ def solids_of(links: Links) -> tuple[Solids, tuple[int, ...], tuple[tuple[int, t
     of = [[None if one.hull is None else Polyhedron(one.hull.planes, one.hull.edges) for one in both] for both in kinds]
     hull = tuple((hulls.setdefault(a, len(hulls) - 1), hulls.setdefault(b, len(hulls) - 1)) for a, b in of)
     solids = Solids(
-        len(bodies), len(shapes), tuple(sides), tuple((a.kind != ROUND, b.kind != ROUND) for a, b in kinds),
+        len(bodies), len(shapes), tuple(sides),
+        tuple((a.kind != SWEPT_SEGMENT, b.kind != SWEPT_SEGMENT) for a, b in kinds),
         tuple((*a.size.tolist(), *b.size.tolist()) for a, b in kinds), tuple((a.radius, b.radius) for a, b in kinds),
         hull, tuple(one for one in hulls if one is not None),
     )  # fmt: skip
@@ -159,23 +160,23 @@ def places_of(trace: Trace, own: Collection[int]) -> list[tuple[int, Value]]:
     return found
 
 
-def values_of(step: ground.ContactStep) -> list[Value]:
+def values_of(step: ground.ContactStepTrace) -> list[Value]:
     """Return stiffness, damping and friction of each pair, and then half of gravity h^2."""
     trace, names = step.trace, ("stiffness", "damping", "friction")
     first, count = len(trace.links.scene.contact_points), len(trace.links.scene.contact_pairs)
-    values = [step.impedance.value(f"contact_{name}", first + pair) for pair in range(count) for name in names]
+    values = [step.joint_laws.value(f"contact_{name}", first + pair) for pair in range(count) for name in names]
     squares = total(x * x for x in trace.links.gravity)
     return [*values, (0.5 * sqrt(squares)) * (step.h * step.h)]
 
 
-class PairedStep(ground.ContactStep):
+class PairedStep(ground.ContactStepTrace):
     """One time step with contacts of bodies with each other, too, as a trace; arguments as those of ContactStep.
 
     Attributes:
         first: stores before the first pass of what the coupling reads.
     """
 
-    looks = False
+    culls = False
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
         """Return the stores of a pass, among them those that the coupling reads, then those after the last pass."""
@@ -208,7 +209,7 @@ class PairedStep(ground.ContactStep):
             given = [trace.graph.input(WRENCH, 6 * number + c) for c in range(6)]
             f, n = (R.T @ Vector(given[3 * part : 3 * part + 3]) for part in range(2))
             forces[id(link)] = forces[id(link)] - Vector((*(n + cross(arm, f)), *f))
-        self.response.append(Store(TWIST, (6 * len(seats),), self.kept.closing))
+        self.response.append(Store(TWIST, (6 * len(seats),), self.pass_variables.closing))
         self.response += self._responses(done, frames)
         more, moved = respond(trace, done, forces)
         for key, (w, v) in moved.items():

@@ -69,7 +69,7 @@ def flies(link: Link) -> bool:
     )
 
 
-class Plan:
+class TiePlan:
     """The carrier of each link, the links that are aggregated, and the order in which they are eliminated.
 
     Args:

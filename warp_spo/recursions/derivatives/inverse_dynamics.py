@@ -14,10 +14,10 @@ from ...trace.scalars import Value
 from ...trace.spatial import ZERO, Rigid, Vector, cross, dot
 from .. import composite, motion, newton_euler
 from ..model import messages
-from ..model.links import Link, Placed
+from ..model.links import Link, LinkPlacement
 from ..motion import STILL, VelocityTerms
 from . import sensitivity
-from .sensitivity import CarriedSums, Row, Sensitivity
+from .sensitivity import CarriedSums, Sensitivity, SensitivityAdjoint
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace
@@ -36,7 +36,7 @@ def inverse_dynamics_derivatives(trace: Trace, mass: bool = True) -> list[Store]
     letters = messages.needed(LETTERS, trace.inputs)
     inner: dict[str, dict[int, list[Value]]] = {letter: {} for letter in letters}  # what links hand to their parents
     drifts: dict[int, Vector] = {}
-    shared: dict[int, tuple[Row, list]] = {}  # of groups, by dof
+    shared: dict[int, tuple[SensitivityAdjoint, list]] = {}  # of groups, by dof
     stores: list[Store] = []
     for link, outward in trace.traversal():
         key, over = id(link), link.parent
@@ -94,10 +94,12 @@ def _wrenches(trace: Trace, link: Link) -> list[tuple[Vector, Vector, Vector]]:
     return found
 
 
-def _sum_of_links(one: tuple[Row, list], row: Row, blocks: list) -> tuple[Row, list]:
+def _sum_of_links(
+    one: tuple[SensitivityAdjoint, list], row: SensitivityAdjoint, blocks: list
+) -> tuple[SensitivityAdjoint, list]:
     """Return the sums of rows and of forces of two links of a group, as their parent feels them."""
     both = zip(one[1], blocks, strict=True)
-    return Row(*(a + b for a, b in zip(one[0], row, strict=True))), [
+    return SensitivityAdjoint(*(a + b for a, b in zip(one[0], row, strict=True))), [
         (block, n + n_other, f + f_other) for (block, n, f), (_, n_other, f_other) in both
     ]
 
@@ -201,7 +203,7 @@ def mass_matrix_derivative(trace: Trace) -> list[Store]:
     return merge(stores) if trace.links.shares_dofs else stores
 
 
-def _column_changes(link: Link, place: Placed, heads: dict, dof: int) -> dict[int, tuple[Vector, Vector]]:
+def _column_changes(link: Link, place: LinkPlacement, heads: dict, dof: int) -> dict[int, tuple[Vector, Vector]]:
     """Changes of the columns H*, in the link's axes, when the link moves by one of its own dofs."""
     theta, d = heads[dof]
     changes = link.hinge.column_changes(place)

@@ -19,7 +19,7 @@ def tangent_gradient(trace: Trace, gradient: dict[tuple, Value]) -> list[tuple[t
             continue
         trace.label(link, "g")
         own = [gradient.get(("q", link.coordinate + i), 0.0) for i in range(link.hinge.coordinates)]
-        along = link.hinge.tangent(link, trace.places[id(link)], trace.vector("q"), own)
+        along = link.hinge.to_tangent(link, trace.places[id(link)], trace.vector("q"), own)
         entries += [((dof,), value) for dof, value in zip(link.dofs, along, strict=True)]
     return entries
 
@@ -30,6 +30,6 @@ def coordinate_directions(trace: Trace, rate: Entry) -> dict[int, Value]:
     for link in trace.links.leaders:
         trace.label(link, "g")
         rates = [rate(dof) for dof in link.dofs]
-        values = link.hinge.untangent(link, trace.places[id(link)], trace.vector("q"), rates)
+        values = link.hinge.from_tangent(link, trace.places[id(link)], trace.vector("q"), rates)
         found |= {link.coordinate + i: value for i, value in enumerate(values)}
     return found

@@ -23,9 +23,9 @@ from ...trace.scalars import Value, absolute, guarded, reciprocal, sqrt
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from .. import articulated, newton_euler
 from ..articulated import NO_INERTIA
-from ..model.links import Link, Links, Placed
+from ..model.links import Link, LinkPlacement, Links
 from ..motion import VelocityTerms, hinge_entries
-from .closures import Closure, Ratio
+from .closures import Closure, CouplingConstraint
 from .nullspace import Basis, NullSpace
 
 Columns = dict[int, Value]  # by dof
@@ -43,7 +43,7 @@ class Cluster:
 
     links: list[Link]
     parent: Link | None
-    constraints: list[tuple[int, Closure | Ratio]]
+    constraints: list[tuple[int, Closure | CouplingConstraint]]
 
     @property
     def dofs(self) -> list[int]:
@@ -55,7 +55,7 @@ class Cluster:
         return [first + i for first, constraint in self.constraints for i in range(constraint.rows)]
 
 
-def clusters(links: Links, constraints: list[Closure | Ratio]) -> list[Cluster]:
+def clusters(links: Links, constraints: list[Closure | CouplingConstraint]) -> list[Cluster]:
     """Return the clusters of a scene, in the order of their first links; links that share dofs go together."""
     owner = {id(link): id(link) for link in links.links}
 
@@ -87,7 +87,7 @@ def clusters(links: Links, constraints: list[Closure | Ratio]) -> list[Cluster]:
 
 
 @dataclasses.dataclass
-class Tied:
+class ClusterConstraints:
     """A cluster at a configuration: its independent rows, factored."""
 
     cluster: Cluster
@@ -96,29 +96,29 @@ class Tied:
     numbers: list[int]  # of the rows, within the cluster
 
     def accelerations(
-        self, places: dict[int, Placed], qd: Any, qdd: Callable[[int], Value] = lambda dof: 0.0
+        self, places: dict[int, LinkPlacement], qd: Any, qdd: Callable[[int], Value] = lambda dof: 0.0
     ) -> list[Value]:
         """Return Y qdd + Y' qd."""
         values = [value for _, c in self.cluster.constraints for value in c.acceleration(places, qd, qdd)]
         return [values[i] for i in self.numbers]
 
-    def errors(self, places: dict[int, Placed], q: Any) -> list[Value]:
+    def errors(self, places: dict[int, LinkPlacement], q: Any) -> list[Value]:
         """Return g."""
         values = [value for _, c in self.cluster.constraints for value in c.error(places, q)]
         return [values[i] for i in self.numbers]
 
 
-def tie_rows(
-    cluster: Cluster, places: dict[int, Placed], kept: Any, epsilon: float, held: frozenset[int] = frozenset()
-) -> Tied:
-    """Return a cluster with the rows ``kept``, by number in the scene; dofs in ``held`` do not move."""
+def independent_rows(
+    cluster: Cluster, places: dict[int, LinkPlacement], kept: Any, epsilon: float, held: frozenset[int] = frozenset()
+) -> ClusterConstraints:
+    """Return a cluster with the rows ``pass_variables``, by number in the scene; dofs in ``held`` do not move."""
     rows = [row for _, constraint in cluster.constraints for row in constraint.jacobian(places)]
     sizes = [size for _, constraint in cluster.constraints for size in constraint.sizes(places)]
     numbers = [i for i, number in enumerate(cluster.rows) if number in kept]
     columns = [dof for dof in cluster.dofs if dof not in held]
     free = [{dof: x for dof, x in rows[i].items() if dof not in held} for i in numbers]
     space = NullSpace(free, [sizes[i] for i in numbers], columns, epsilon)
-    return Tied(cluster, space, [rows[i] for i in numbers], numbers)
+    return ClusterConstraints(cluster, space, [rows[i] for i in numbers], numbers)
 
 
 @dataclasses.dataclass
@@ -158,7 +158,7 @@ class ClusterFactor:
 def factor(
     cluster: Cluster,
     space: NullSpace | Basis,
-    places: dict[int, Placed],
+    places: dict[int, LinkPlacement],
     own: dict[int, Articulated],
     epsilon: float,
     stiffened: Callable[[Link], Link],
@@ -232,7 +232,7 @@ def _pivots(D: list[list[Value]], least: list[Value]) -> tuple[list[list[Value]]
 
 def hinge_forces(
     cluster: Cluster,
-    places: dict[int, Placed],
+    places: dict[int, LinkPlacement],
     motions: dict[int, VelocityTerms],
     own: dict[int, Articulated],
     loads: dict[int, Vector],

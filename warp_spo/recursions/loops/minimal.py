@@ -18,7 +18,7 @@ from ..articulated import NO_INERTIA
 from ..articulated_sweeps import mirror, weighted_products
 from ..model.links import Link
 from ..motion import STILL
-from . import clusters as aggregates
+from . import clusters
 from .clusters import Cluster, Columns
 from .embedded import ClosedLoops, Embedding, Swept
 from .nullspace import Basis, NullSpace
@@ -32,13 +32,13 @@ NO_FORCE = Vector((*ZERO, *ZERO))
 
 def columns_of(loops: ClosedLoops, cluster: Cluster, moves: bool) -> tuple[dict[int, Columns], Columns, Value]:
     """Return X of a cluster by independent dof; its k; and zero, or NaN where the rows lose rank."""
-    tied = loops.tie(cluster, loops.embedding.dofs)
+    constrained = loops.constrain(cluster, loops.embedding.dofs)
     X = {
-        dof: {dof: 1.0, **tied.space.particular([-row.get(dof, 0.0) for row in tied.rows])}
+        dof: {dof: 1.0, **constrained.space.particular([-row.get(dof, 0.0) for row in constrained.rows])}
         for dof in cluster.dofs
         if dof in loops.embedding.dofs
     }
-    return X, loops.demanded(tied) if moves else {}, tied.space.lost_pivot
+    return X, loops.demanded(constrained) if moves else {}, constrained.space.lost_pivot
 
 
 def columns_of_all(loops: ClosedLoops) -> dict[int, Columns]:
@@ -53,7 +53,7 @@ def demand(loops: ClosedLoops) -> Columns:
     """Return k by dof, zero of dofs that no loop ties; after the links are placed with their velocities."""
     found: Columns = dict.fromkeys(range(loops.trace.links.scene.dof_count), 0.0)
     for cluster in loops.clusters:
-        found |= loops.demanded(loops.tie(cluster, loops.embedding.dofs))
+        found |= loops.demanded(loops.constrain(cluster, loops.embedding.dofs))
     return found
 
 
@@ -206,7 +206,7 @@ def _eliminate_cluster(
     done = swept.clusters[id(cluster)]
     loads = {id(other): NO_FORCE for other in cluster.links} | {id(link): force}
     own = dict.fromkeys(loads, NO_INERTIA)
-    t, force = aggregates.hinge_forces(cluster, loops.trace.places, loops.trace.motions, own, loads, lambda dof: 0.0)
+    t, force = clusters.hinge_forces(cluster, loops.trace.places, loops.trace.motions, own, loads, lambda dof: 0.0)
     eps = [total(x * (tau.get(dof, 0.0) - t[dof]) for dof, x in column.items()) for column in done.X]
     for column, rate in zip(done.U, done.solve(eps), strict=True):
         force = force + column * rate
@@ -235,8 +235,8 @@ def hybrid_dynamics(trace: Trace, embedding: Embedding, mask: tuple[bool, ...]) 
 
     def allowed(cluster: Cluster) -> tuple[NullSpace | Basis, Columns]:
         if not any(mask[dof] for dof in cluster.dofs):
-            tied = loops.tie(cluster)
-            return tied.space, loops.demanded(tied) if moves else {}
+            constrained = loops.constrain(cluster)
+            return constrained.space, loops.demanded(constrained) if moves else {}
         X, k, lost_pivot = columns_of(loops, cluster, moves)
         for dof, column in X.items():
             for other, x in column.items() if mask[dof] else ():

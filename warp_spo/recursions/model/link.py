@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import NamedTuple
 
-from ...hinges.hinge_type import Kind
+from ...hinges.hinge_type import HingeType
 from ...trace.scalars import Value, is_constant
 from ...trace.spatial import ZERO, Matrix, Rigid, Vector
 
@@ -45,7 +45,7 @@ class Link:
     """
 
     parent: Link | None
-    hinge: Kind
+    hinge: HingeType
     matrix: Matrix | None
     offset: Vector
     align: Matrix | None

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...hinges.hinge_type import Placed as Placed
+from ...hinges.hinge_type import LinkPlacement as LinkPlacement
 from ...scene.actuators import ACTUATOR_VALUES, RANGES
 from ...scene.flexible.modes import Amplitudes
 from ...scene.parts import DOF_VALUES
@@ -338,7 +338,7 @@ class Links:
                 continue
             if not all(map(is_constant, (*own.packed, *link.offset, *(x for row in link.matrix or () for x in row)))):
                 continue
-            parts = link.hinge.regrouped(own)
+            parts = link.hinge.split_inertia(own)
             if parts is None:
                 continue
             handed, kept = parts
@@ -352,9 +352,9 @@ class Links:
                 link.grouped, parent.grouped = kept, after
 
 
-def place_link(link: Link, q: Any) -> Placed:
+def place_link(link: Link, q: Any) -> LinkPlacement:
     """Return ``link`` where the coordinates put it; ``q(i)`` is entry i."""
-    return link.hinge.placed(link, q)
+    return link.hinge.transform(link, q)
 
 
 def _price(inertia: Rigid) -> int:

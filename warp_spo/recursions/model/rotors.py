@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...hinges.rotor_axis import Spin
+from ...hinges.rotor_axis import RotorAxis
 from ...scene.gears import Rotor
 from ...trace.spatial import ZERO, Matrix, Pose, Rigid, Vector, symmetric
 from .link import Link, SharedDofs
@@ -27,7 +27,7 @@ def add(links: Links, driven: Link, rotor: Rotor, axes: Matrix, origin: Vector) 
     """Add the rotor of the hinge that moves ``driven``, whose parent anchor sits at ``origin`` in ``axes``."""
     link = dataclasses.replace(
         driven,
-        hinge=Spin(rotor.ratio),
+        hinge=RotorAxis(rotor.ratio),
         matrix=still(axes @ aligned(rotor.axis)),
         offset=origin + axes @ Vector(rotor.com.tolist()),
         align=None,
@@ -62,4 +62,4 @@ def locked(rotor: Rotor, axes: Matrix, origin: Vector) -> Rigid:
 
 def own_link(links: Links, node: int) -> Link | None:
     """Return the link of the rotor of a body's hinge, if it has one."""
-    return next((link for link in links.links if link.node == node and isinstance(link.hinge, Spin)), None)
+    return next((link for link in links.links if link.node == node and isinstance(link.hinge, RotorAxis)), None)

@@ -20,7 +20,7 @@ from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from ..articulated import LEAST, NO_INERTIA, columns
 from ..motion import VelocityTerms
 from .link import Link
-from .links import Placed
+from .links import LinkPlacement
 
 NO_FORCE = Vector((*ZERO, *ZERO))
 
@@ -65,7 +65,7 @@ class SharedFactor:
 
 def factor(
     stiffened: Link,
-    places: dict[int, Placed],
+    places: dict[int, LinkPlacement],
     carried: dict[int, Articulated],
     epsilon: float,
     held: list[Value] | None = None,
@@ -115,7 +115,7 @@ def factor(
 
 def reduce(
     done: SharedFactor,
-    places: dict[int, Placed],
+    places: dict[int, LinkPlacement],
     motions: dict[int, VelocityTerms],
     forces: dict[int, Vector],
     tau: list[Value],

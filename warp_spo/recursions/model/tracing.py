@@ -16,7 +16,7 @@ from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Vector, cross
 from .. import motion, newton_euler
 from ..motion import STILL, VelocityTerms
 from . import messages
-from .links import Link, Links, Placed, place_link
+from .links import Link, LinkPlacement, Links, place_link
 from .segments import Segment
 
 EPSILON = {"float32": 2.0**-23, "float64": 2.0**-52}
@@ -85,7 +85,7 @@ class Trace:
         while above is not None:
             self.active.add(id(above))
             above = above.parent
-        self.places: dict[int, Placed] = {}
+        self.places: dict[int, LinkPlacement] = {}
         self.motions: dict[int, VelocityTerms] = {}
         self.axes: dict[int, Matrix] = {}
         self.compensates_gravity = False

@@ -8,9 +8,7 @@ import warp as wp
 from support import zoo
 from warp_spo.execution.device_facts import MEASURED
 from warp_spo.execution.plan import choose
-from warp_spo.kernels import native
-from warp_spo.kernels import shared_rows as staged_rows
-from warp_spo.kernels import straight_line as straight
+from warp_spo.kernels import native, shared_rows, straight_line
 from warp_spo.recursions.forward_dynamics import forward_dynamics_bias_first
 from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.model.tracing import Trace
@@ -78,16 +76,19 @@ def test_forward_dynamics_has_the_same_bits(device):
                       lambda array, entry, value: f"if (mine) result_row[{entry}] = {value};",
                       lambda array, index: index[0], fuses=True)  # fmt: skip
     plain = render(emitter.region(stores), "float32")
-    rows = [staged_rows.SharedRow(name, 2, array.shape[1]) for name, array in given.items()]
-    frame = straight.KernelLayout(
-        rows=rows, staged=False, fields=[], result=straight.ResultLayout(straight.DIRECT, rows[1]._replace(name="out")),
+    rows = [shared_rows.SharedRow(name, 2, array.shape[1]) for name, array in given.items()]
+    frame = straight_line.KernelLayout(
+        rows=rows,
+        staged=False,
+        fields=[],
+        result=straight_line.ResultLayout(straight_line.DIRECT, rows[1]._replace(name="out")),
         messages=0, warps=1, block=32)  # fmt: skip
     found = []
     for places in (0, 4, 40):
         text = spill_registers(plain, "float", places) if places else plain
         assert (text.count("= ASIDE(") > 4) == bool(places)
         cpu = f"float aside[{places + 1}];\n#define ASIDE(i) aside[i]\n{text}\n#undef ASIDE"
-        cuda = straight.assemble(frame._replace(spill_slots=places), text, cpu, wp.float32)
+        cuda = straight_line.assemble(frame._replace(spill_slots=places), text, cpu, wp.float32)
         kernel = native.kernel("aside", cuda, [(row.name, 2) for row in rows] + [("out", 2)], wp.float32)
         arrays = [wp.array(array, dtype=wp.float32, device=device) for array in given.values()]
         out = wp.full((40, scene.dof_count), float("nan"), dtype=wp.float32, device=device)

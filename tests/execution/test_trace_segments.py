@@ -9,13 +9,13 @@ import pytest
 import warp_spo as spo
 from support import laws, warp_machine, zoo
 from support.granularity_scenes import mirrored
-from support.pieces_of_trees import TREES, hand
 from support.quick import slow_unless
 from support.robots import ROBOTS
 from support.routines import ROUTINES
+from support.segments_of_trees import TREES, hand
 from warp_spo.execution import plan
 from warp_spo.execution.segment import shared_code
-from warp_spo.kernels import straight_line as straight
+from warp_spo.kernels import straight_line
 from warp_spo.recursions.model import shared_constants
 from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.model.segments import Segments
@@ -100,7 +100,7 @@ def test_results_over_rows_that_warps_share(name, operation, monkeypatch):
     monkeypatch.setattr(plan, "FEW_WORLDS", 0)
     texts = warp_machine.recorded(monkeypatch)
     text, arrays, wanted = built(texts, TREES[name](), operation)
-    assert text.frame.staged or not text.frame.result.way == straight.IN_PLACE
+    assert text.frame.staged or not text.frame.result.way == straight_line.IN_PLACE
     for backwards in (False, True):
         got = warp_machine.run(text, arrays, backwards)
         assert laws.error(got, wanted.reshape(got.shape)) <= laws.TOLERANCE["float64"]
@@ -116,11 +116,11 @@ def test_results_that_leave_through_shared_memory(monkeypatch):
         call(spo.Dynamics(scene, 3, device="cpu", granularity="tree"))
         return texts[-1].frame
 
-    for wrt, ways in ((("q", "qd", "tau"), (straight.STAGED, 2)), (("q", "qd"), (straight.DIRECT, 0))):
+    for wrt, ways in ((("q", "qd", "tau"), (straight_line.STAGED, 2)), (("q", "qd"), (straight_line.DIRECT, 0))):
         found = frame(lambda dyn, wrt=wrt: dyn.forward_dynamics_vjp(q, qd, tau, cotangent=tau, wrt=wrt))
         assert (found.result.way, len(found.staged_further)) == ways and not found.staged
-    assert frame(lambda dyn: dyn.inverse_dynamics(q, qd, tau)).result.way == straight.DIRECT
-    assert frame(lambda dyn: dyn.inverse_dynamics(q, qd, tau), few=0).result.way == straight.STAGED
+    assert frame(lambda dyn: dyn.inverse_dynamics(q, qd, tau)).result.way == straight_line.DIRECT
+    assert frame(lambda dyn: dyn.inverse_dynamics(q, qd, tau), few=0).result.way == straight_line.STAGED
 
 
 @pytest.mark.parametrize("name", ["fork", "hand"])
