@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..reference.rotations import rotation
-from ..scene.contacts import HeightField
+from ..scene.ground import HeightField
 from .robots import Primitive, Robot
 
 SUN = np.array([0.35, -0.25, 0.9]) / np.linalg.norm([0.35, -0.25, 0.9])  # direction to the light

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from ..scene.collision_shapes import Shape
-from ..scene.contacts import HeightField
+from ..scene.ground import HeightField
 from .mechanism import xyzw
 from .source import Source
 

@@ -14,7 +14,8 @@ from newton import GeoType, ShapeFlags
 
 from ..errors import UnsupportedError
 from ..scene.collision_shapes import TURNED, Choice, Chosen, Shape
-from ..scene.contacts import HeightField, pose_matrix
+from ..scene.frames import pose_matrix
+from ..scene.ground import HeightField
 from ..scene.scene import Scene
 from .elevations import Fields
 from .worlds import Worlds, to_numpy, unit_pose

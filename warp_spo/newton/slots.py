@@ -13,7 +13,8 @@ from ..errors import UnsupportedError
 from ..kernels import declare
 from ..kernels import newton_contact_slots as kernels
 from ..scene.collision_shapes import moving_bodies
-from ..scene.contacts import PLACE, Contact, Listed
+from ..scene.contacts import Contact
+from ..scene.ground import PLACE, Listed
 from ..scene.scene import Scene
 from ..status import Status
 from .model_contacts import ModelShapes

@@ -15,7 +15,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..errors import UnsupportedError, as_integer
-from .contacts import Contact, HeightField, Plane, Stand, pose_matrix, spread_directions
+from .contact_values import Stand
+from .contacts import Contact, spread_directions
+from .frames import pose_matrix
+from .ground import HeightField, Plane
 from .hulls import farthest_beyond
 
 if TYPE_CHECKING:

@@ -11,7 +11,8 @@ import numpy as np
 
 from ..errors import UnsupportedError, as_integer
 from .collision_shapes import Shape
-from .contacts import Contact, pose_matrix, spread_directions
+from .contacts import Contact, spread_directions
+from .frames import pose_matrix
 from .hulls import Hull, convex_hull, grown, is_convex
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import warp as wp
 
 from ..dynamics.dynamics import Dynamics
 from ..scene import terrain
-from ..scene.contacts import HeightField
+from ..scene.ground import HeightField
 from . import drawing
 
 GROUNDS = ("flat", "rough", "stairs")
