@@ -14,6 +14,7 @@ from newton import GeoType, ShapeFlags
 
 from ..errors import UnsupportedError
 from ..scene.collision_shapes import TURNED, Choice, Chosen, Shape
+from ..scene.contact_shapes import SHAPES, kinds_in
 from ..scene.frames import pose_matrix
 from ..scene.ground import HeightField
 from ..scene.scene import Scene
@@ -23,19 +24,8 @@ from .worlds import Worlds, to_numpy, unit_pose
 KINDS = {
     GeoType.PLANE: "plane",
     GeoType.HFIELD: "height field",
-    GeoType.SPHERE: "sphere",
-    GeoType.CAPSULE: "capsule",
-    GeoType.ELLIPSOID: "ellipsoid",
-    GeoType.CYLINDER: "cylinder",
-    GeoType.BOX: "box",
-    GeoType.MESH: "hull",
-    GeoType.CONE: "cone",
-    GeoType.CONVEX_MESH: "hull",
+    **{GeoType[name]: kind for name, kind in kinds_in("newton").items()},
 }
-SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "cone": 2}
-"""Numbers of a shape's scale that count; of others all three."""
-
-
 CONTACT_MATERIALS = {"contact_friction": "mu", "contact_stiffness": "ke", "contact_damping": "kd"}
 """Materials of shapes by the values of a scene that they are."""
 
@@ -273,6 +263,7 @@ def _triangles(mesh: Any) -> np.ndarray:
 
 
 def _model_sizes(source: Any, kind: str, scale: np.ndarray) -> Any:
-    if kind == "hull":
-        return np.asarray(source.vertices, dtype=np.float64) * scale
-    return scale[: SIZES.get(kind, 3)]
+    if kind not in SHAPES:
+        return scale
+    sizes = SHAPES[kind].sizes
+    return np.asarray(source.vertices, dtype=np.float64) * scale if sizes is None else scale[: len(sizes)]
