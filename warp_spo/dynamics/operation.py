@@ -46,7 +46,7 @@ from ..scene.contact_values import CONTACT_VALUES
 from ..scene.frames import check_frames, origins
 from ..scene.ground import HEIGHTS
 from ..scene.scene import Scene
-from . import trial_inputs as samples
+from . import trial_inputs
 from .call_replay import MISS
 
 if TYPE_CHECKING:
@@ -148,13 +148,15 @@ ORIENTED_FRAMES = Option(
     "frames",
     lambda scene, call, frames: check_frames(scene, call.name, frames),
     lambda scene: [0],
-    sample=samples.two_frames,
+    sample=trial_inputs.two_frames,
 )
 FRAMES = dataclasses.replace(
     ORIENTED_FRAMES,
     read=lambda scene, call, frames: origins(check_frames(scene, call.name, frames)),  # their axes do not enter
 )
-DT = Option("dt", lambda scene, call, dt: seconds(call, dt), lambda scene: STAND_IN, False, lambda scene: samples.DT)
+DT = Option(
+    "dt", lambda scene, call, dt: seconds(call, dt), lambda scene: STAND_IN, False, lambda scene: trial_inputs.DT
+)
 
 
 # -- closed loops ------------------------------------------------------------------------------------------------------

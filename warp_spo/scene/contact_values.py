@@ -23,7 +23,7 @@ DAMPING = 0.5  # of sqrt(k m), the share of mass over one point; standing is qui
 STANDARD_GRAVITY = 9.81  # [m/s^2], in scenes without gravity
 
 
-class Stand(Stored):
+class NeutralPose(Stored):
     """A scene in its neutral configuration, as the constants of contacts need it."""
 
     def __init__(self, scene: Any):
@@ -65,7 +65,7 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
     }
     if not scene.contact_count:
         return values
-    stand = Stand(scene)
+    stand = NeutralPose(scene)
     for i, pair in enumerate(scene.contact_pairs, start=len(points)):
         found = pair_values(pair, scene, stand)
         for name, value in zip(CONTACT_VALUES, found, strict=True):

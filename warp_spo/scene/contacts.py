@@ -35,7 +35,7 @@ class Contact(ShapeArguments):
             contact with the ground.
         friction: ratio of the largest friction force to the normal force.
         stiffness: of each point [N/m]; None: so that a robot that stands on up to four points sinks by 1.7 mm, and so
-            that the points of one body, if they span a sole, carry the whole robot. See ``contact_points`` of
+            that the points of one body, if they span an area, carry the whole robot. See ``contact_points`` of
             :class:`Scene`. With ``other``, of the pair; None: the lighter of the two, with all that is connected to
             it, sinks by 0.1 mm where it rests on the other; of bodies connected to each other, with all that they
             carry.

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import UnsupportedError, as_integer
 from .contact_shapes import ConvexShape, as_pair, most_points
 
-SINK = 1e-4  # how far the lighter body sinks in [m] that rests on the other one, where the stiffness is chosen
+STATIC_SINK = 1e-4  # how far the lighter body sinks in [m] that rests on the other one, where the stiffness is chosen
 DAMPING = 2.0  # of sqrt(k m): critical, so that stacks come to rest
 
 
@@ -76,10 +76,10 @@ def _partner(call: str, contact: Any, contacts: Sequence[Any]) -> Any:
     return own[0]
 
 
-def pair_values(pair: ContactPair, scene: Any, stand: Any) -> tuple[float, float, float]:
+def pair_values(pair: ContactPair, scene: Any, neutral: Any) -> tuple[float, float, float]:
     """Return friction, stiffness [N/m] and damping [N s/m] of a pair; what its contact leaves open is chosen."""
     contact, parents, masses = scene.contacts[pair.contact], scene.tree.parent, []
-    together = pair.other >= 0 and stand.roots[pair.body] == stand.roots[pair.other]
+    together = pair.other >= 0 and neutral.roots[pair.body] == neutral.roots[pair.other]
     for body in (pair.body, pair.other) if pair.other >= 0 else (pair.body,):
         way = [body]
         while parents[way[-1]] >= 0:
@@ -87,8 +87,10 @@ def pair_values(pair: ContactPair, scene: Any, stand: Any) -> tuple[float, float
         if any(scene.hinges[scene.hinge_of[one]].dof_count for one in way):
             carried = [other for other in range(len(parents)) if not together or scene.tree.is_ancestor(body, other)]
             carried += [body] if together else []
-            masses.append(sum(stand.masses[other] for other in set(carried) if stand.roots[other] == stand.roots[body]))
+            masses.append(
+                sum(neutral.masses[other] for other in set(carried) if neutral.roots[other] == neutral.roots[body])
+            )
     mass = float(min(masses, default=0.0)) or 1.0
-    k = mass * stand.gravity / SINK if contact.stiffness is None else contact.stiffness
+    k = mass * neutral.gravity / STATIC_SINK if contact.stiffness is None else contact.stiffness
     d = DAMPING * np.sqrt(k * mass) if contact.damping is None else contact.damping
     return contact.friction, float(k), float(d)

@@ -8,7 +8,7 @@ from itertools import combinations, product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import UnsupportedError, as_integer
-from .collision_shapes import Shape
+from .collision_shapes import CollisionShape
 from .contact_shapes import SHAPES, ContactShape
 from .contacts import Contact
 
@@ -33,8 +33,8 @@ HULL_WAYS = (
 class ShapePair(NamedTuple):
     """Two shapes of two bodies; reported forces are those on the first, which moves."""
 
-    first: Shape
-    second: Shape
+    first: CollisionShape
+    second: CollisionShape
 
     @property
     def fits(self) -> bool:
@@ -43,7 +43,7 @@ class ShapePair(NamedTuple):
 
     def contact(self) -> Contact:
         """Return the contact that stands for the pair, with the means of the shapes' materials."""
-        a, b = self.first.on(self.second), self.second
+        a, b = self.first.with_mean_material(self.second), self.second
         solids = [_with_margins(one, other).arguments() for one, other in ((a, b), (b, a))]
         material = {name: getattr(a, name) for name in ("stiffness", "damping")}
         if a.friction is not None:
@@ -56,7 +56,7 @@ class ShapePair(NamedTuple):
         return " with ".join(shape.words(bodies) for shape in self)
 
 
-def _with_margins(shape: Shape, other: Shape) -> ContactShape:
+def _with_margins(shape: CollisionShape, other: CollisionShape) -> ContactShape:
     """Return a shape as it meets another one, larger by its margin and by that which the other one lends."""
     own, met = shape.contact_shape(), SHAPES[other.kind]
     found = own.grown(0.0 if own.lends_margin and met.swept else shape.rounding)
@@ -64,7 +64,7 @@ def _with_margins(shape: Shape, other: Shape) -> ContactShape:
 
 
 @dataclasses.dataclass(frozen=True)
-class PairChoice:
+class PairSelection:
     """Pairs of shapes of a source that touch each other.
 
     Args:
@@ -77,12 +77,12 @@ class PairChoice:
 
     call: str
     scene: Scene
-    shapes: Sequence[Shape]
-    allowed: Callable[[Shape, Shape], bool]
-    numbers: dict[int, Shape]
+    shapes: Sequence[CollisionShape]
+    allowed: Callable[[CollisionShape, CollisionShape], bool]
+    numbers: dict[int, CollisionShape]
     _lacking: dict[int, str] = dataclasses.field(default_factory=dict, init=False)
 
-    def moves(self, shape: Shape) -> bool:
+    def moves(self, shape: CollisionShape) -> bool:
         """Whether a shape moves; that of a body that is fixed to the inertial frame does not."""
         return self._carrier(shape.body) >= 0
 
@@ -112,7 +112,7 @@ class PairChoice:
 
     def first_of_separate_trees(self) -> ShapePair | None:
         """Return two shapes of bodies that no joint connects, and which may touch; None if there are none."""
-        trees: dict[int, list[Shape]] = {}
+        trees: dict[int, list[CollisionShape]] = {}
         for shape in filter(self.moves, self.shapes):
             body = shape.body
             while self.scene.tree.parent[body] >= 0:
@@ -121,7 +121,7 @@ class PairChoice:
         sides = (pair for one, other in combinations(trees.values(), 2) for pair in product(one, other))
         return next((ShapePair(*pair) for pair in sides if self.allowed(*pair)), None)
 
-    def _all_pairs(self, solid: Sequence[Shape]) -> tuple[list[ShapePair], list[str]]:
+    def _all_pairs(self, solid: Sequence[CollisionShape]) -> tuple[list[ShapePair], list[str]]:
         """Return every pair that may touch, and in words those that no contact represents."""
         pairs = [ShapePair(*pair) for pair in combinations(solid, 2) if self._may_touch(*pair)]
         found = [pair for pair in pairs if self._stands(pair)]
@@ -161,13 +161,13 @@ class PairChoice:
         """Whether a contact can stand for a pair."""
         return pair.fits and not any(map(self._lacks, pair))
 
-    def _lacks(self, shape: Shape) -> str:
+    def _lacks(self, shape: CollisionShape) -> str:
         """Return why no contact can have a shape of its kind; "" if one can."""
         if shape.index not in self._lacking:
             self._lacking[shape.index] = shape.contact_shape().refusal(shape.triangles)
         return self._lacking[shape.index]
 
-    def _shapes_of_name(self, name: Any) -> list[Shape]:
+    def _shapes_of_name(self, name: Any) -> list[CollisionShape]:
         """Return the shapes of a name or a number."""
         number, bodies = as_integer(name), self.scene.body_labels
         if number is not None:
@@ -182,7 +182,7 @@ class PairChoice:
             raise ValueError(f"{self.call}: pairs holds {name!r}, which is no collision shape; expected {known}")
         return found
 
-    def _may_touch(self, a: Shape, b: Shape) -> bool:
+    def _may_touch(self, a: CollisionShape, b: CollisionShape) -> bool:
         """Whether two shapes can move against each other, and the source lets them collide."""
         return self._carrier(a.body) != self._carrier(b.body) and self.allowed(a, b)
 
