@@ -7,7 +7,7 @@ import warp as wp
 from .newton_contacts import MOVING, in_world
 
 EMPTY = wp.constant(2**31 - 1)  # a slot that no contact fills
-AWAY = wp.constant(-1e3)  # depth of a point without contact [m], as warp_spo.scene.contacts.AWAY; a test compares
+AWAY = wp.constant(-1e3)  # depth of a point without contact [m], as warp_spo.scene.ground.AWAY; a test compares
 
 
 @functools.cache

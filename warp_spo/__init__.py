@@ -14,12 +14,13 @@ from .graph.factorization import Factorization
 from .graph.operators import BWA, Blocks, Identity, Operator
 from .scene import terrain
 from .scene.actuators import Actuator, Keyframe
-from .scene.contacts import Contact, HeightField, Plane
+from .scene.contacts import Contact
 from .scene.flexible.beams import beam_modes
 from .scene.flexible.modes import MassPoints, Modes
 from .scene.flexible.normal_modes import normal_modes
 from .scene.flexible.sections import Material, Section
 from .scene.gears import Rotor
+from .scene.ground import HeightField, Plane
 from .scene.parts import Body, Coupling, Hinge, Loop
 from .scene.scene import Scene
 from .scene.tree import Digraph, Tree

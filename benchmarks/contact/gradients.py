@@ -23,7 +23,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.dynamics.operation import derivative_of
 from warp_spo.dynamics.stepping.step import STEP
-from warp_spo.scene.contacts import HEIGHTS
+from warp_spo.scene.ground import HEIGHTS
 from warp_spo.viewing.charts import OTHER, OURS
 
 from ..capabilities import SETS, measure_time

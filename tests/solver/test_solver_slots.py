@@ -11,7 +11,7 @@ from warp_spo import Status
 from warp_spo.errors import UnsupportedError
 from warp_spo.kernels import newton_contact_slots
 from warp_spo.newton import SolverSPO
-from warp_spo.scene import contacts as scene_contacts
+from warp_spo.scene import ground
 
 RADIUS, PLANE = 0.19, 4  # of the spheres; index of the plane's shape
 ROUNDING = 2e-6  # of float32, in metres, after three steps
@@ -166,7 +166,7 @@ def test_a_slider_does_not_turn():
 
 
 def test_models_that_have_no_slots():
-    assert float(newton_contact_slots.AWAY) == scene_contacts.AWAY
+    assert float(newton_contact_slots.AWAY) == ground.AWAY
     with pytest.raises(UnsupportedError, match="contacts of a model without shapes that stand still"):
         SolverSPO(boxes(None), contacts="pipeline")
     with pytest.raises(UnsupportedError, match="contacts='pipeline' with integrator='rk4'"):

@@ -11,6 +11,14 @@ from .contact_cases import solid
 H = 5e-3
 WEDGE = np.array([[x, y, z] for y in (-0.1, 0.1) for x, z in ((-0.15, 0.0), (0.12, 0.0), (0.12, 0.1))])  # 20 degrees
 STRAIGHT = np.array([0.0, 0.0, 0.0, 1.0])
+SHAPE_ARGUMENTS = {
+    "point": (0.1, 0.2, 0.3),
+    "sphere": ((0.1, 0.2, 0.3), 0.1),
+    "capsule": ((0.1, 0.0, 0.0), (0.0, 0.2, 0.0), 0.1),
+    "box": ((0.1, 0.2, 0.3), (0.3, -0.2, 0.1, np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))),
+    "hull": WEDGE,
+}
+"""Of a Contact, by kind of shape."""
 
 
 def cube(mass, half):

@@ -12,7 +12,6 @@ from warp_spo.kernels.elementary import C_TYPE, NATIVE
 from warp_spo.recursions.contact.couples import Polyhedron
 from warp_spo.reference import body_contact
 from warp_spo.reference.rotations import homogeneous
-from warp_spo.scene.pairs import shape_of
 
 from .pair_scenes import WEDGE
 from .pair_steps import plant
@@ -68,7 +67,7 @@ solids::touch(a, b, out + HEADER * worlds, worlds, row[2] && row[3] ? TOGETHER :
 
 def hull_of(points):
     """Return the hull of points about its middle, and that."""
-    solid = shape_of("test", spo.Contact(0, hull=points))
+    solid = spo.Contact(0, hull=points).shape.convex("test")
     return solid.hull, solid.pose[:3]
 
 

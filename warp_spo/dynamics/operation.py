@@ -42,8 +42,9 @@ from ..recursions.model.links import LINK_VALUES, MOTION_VALUES, Links
 from ..runtime.arrays import Call
 from ..runtime.autograd import call_in_graph, call_with_gradient, is_exported, is_traced, records_gradient
 from ..runtime.dlpack import settle
-from ..scene.contacts import CONTACT_VALUES, HEIGHTS
+from ..scene.contact_values import CONTACT_VALUES
 from ..scene.frames import check_frames, origins
+from ..scene.ground import HEIGHTS
 from ..scene.scene import Scene
 from . import trial_inputs
 from .call_replay import MISS

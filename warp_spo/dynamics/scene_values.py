@@ -14,7 +14,7 @@ from ..runtime.arrays import AnyArray, ArrayT, Call, shape_of
 from ..runtime.autograd import records_gradient
 from ..runtime.dlpack import settle
 from ..scene.actuators import check_actuator_value
-from ..scene.contacts import CONTACT_VALUES
+from ..scene.contact_values import CONTACT_VALUES
 from ..scene.parts import real
 from ..scene.scene import refuse_negative
 from . import actuators

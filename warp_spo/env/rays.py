@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..scene.contacts import HeightField, Plane
+from ..scene.ground import HeightField, Plane
 from ..trace.functions import where
 from .compile.vectors import rotate, rotate_back, vector
 from .observations import Each

@@ -17,7 +17,7 @@ from ..recursions.model.flexible import attach
 from ..recursions.model.links import Links
 from ..recursions.model.messages import INWARD, OUTWARD
 from ..recursions.step.step import FORCE, LOOPED, RESISTANCE
-from ..scene.contacts import HeightField
+from ..scene.ground import HeightField
 from ..trace.emission import Store
 from . import staging
 from .device_facts import RESERVED

@@ -20,7 +20,8 @@ from ..recursions.contact.ground import CORNERS
 from ..runtime import launches
 from ..runtime.memory import broadcast_worlds, empty, size_in_bytes
 from ..scene.actuators import ACTUATOR_VALUES
-from ..scene.contacts import CONTACT_VALUES, GROUND_VALUES, HEIGHTS
+from ..scene.contact_values import CONTACT_VALUES
+from ..scene.ground import GROUND_VALUES, HEIGHTS
 from ..scene.scene import Scene
 from .node.functions import node_functions
 from .row_copies import as_rows, copy_rows

@@ -24,7 +24,8 @@ from ..kernels.straight_line import (
 from ..kernels.substeps import SUBSTEPS
 from ..recursions.model.links import TABLES
 from ..scene.actuators import ACTUATOR_VALUES
-from ..scene.contacts import CONTACT_VALUES, GROUND_VALUES
+from ..scene.contact_values import CONTACT_VALUES
+from ..scene.ground import GROUND_VALUES
 from ..scene.parts import DOF_VALUES
 from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant, ordered

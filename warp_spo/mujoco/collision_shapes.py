@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 
 from ..scene.collision_shapes import CollisionShape
-from ..scene.contacts import HeightField
+from ..scene.contact_shapes import SHAPES, kinds_in
+from ..scene.ground import HeightField
 from .mechanism import xyzw
 from .source import Source
 
@@ -16,7 +17,7 @@ GEOMS = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")): name.lower() for name i
     "PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH", "SDF")}  # fmt: skip
 """MuJoCo's kinds by number."""
 Pairs = dict[frozenset[int], int]  # number of an explicit pair by its two geoms
-KINDS = {"mesh": "hull", "hfield": "height field"}
+KINDS = {"hfield": "height field", **{name.lower(): kind for name, kind in kinds_in("mujoco").items()}}
 
 
 def collision_shapes(source: Source, moving: np.ndarray) -> list[CollisionShape]:
@@ -118,12 +119,15 @@ def _shape(source: Source, geom: int, friction: float | None, margin: float) -> 
 
 def _sizes(m: Any, geom: int, kind: str) -> Any:
     size, data = np.array(m.geom_size[geom]), int(m.geom_dataid[geom])
-    if kind == "mesh":
-        first = int(m.mesh_vertadr[data])
-        return np.array(m.mesh_vert[first : first + int(m.mesh_vertnum[data])], dtype=np.float64)
     if kind == "hfield":
         return _field(m, data)
-    return size[: {"sphere": 1, "capsule": 2, "cylinder": 2}.get(kind, 3)]
+    if KINDS.get(kind) not in SHAPES:
+        return size
+    sizes = SHAPES[KINDS[kind]].sizes
+    if sizes is None:
+        first = int(m.mesh_vertadr[data])
+        return np.array(m.mesh_vert[first : first + int(m.mesh_vertnum[data])], dtype=np.float64)
+    return size[: len(sizes)]
 
 
 def _field(m: Any, number: int) -> HeightField:

@@ -14,7 +14,9 @@ from newton import GeoType, ShapeFlags
 
 from ..errors import UnsupportedError
 from ..scene.collision_shapes import AXIS_TOLERANCE, CollisionShape, SelectedContacts, ShapeSelection
-from ..scene.contacts import HeightField, pose_matrix
+from ..scene.contact_shapes import SHAPES, kinds_in
+from ..scene.frames import pose_matrix
+from ..scene.ground import HeightField
 from ..scene.scene import Scene
 from .elevations import Fields
 from .worlds import WorldRows, to_numpy, unit_pose
@@ -22,19 +24,8 @@ from .worlds import WorldRows, to_numpy, unit_pose
 KINDS = {
     GeoType.PLANE: "plane",
     GeoType.HFIELD: "height field",
-    GeoType.SPHERE: "sphere",
-    GeoType.CAPSULE: "capsule",
-    GeoType.ELLIPSOID: "ellipsoid",
-    GeoType.CYLINDER: "cylinder",
-    GeoType.BOX: "box",
-    GeoType.MESH: "hull",
-    GeoType.CONE: "cone",
-    GeoType.CONVEX_MESH: "hull",
+    **{GeoType[name]: kind for name, kind in kinds_in("newton").items()},
 }
-SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "cone": 2}
-"""Numbers of a shape's scale that count; of others all three."""
-
-
 CONTACT_MATERIALS = {"contact_friction": "mu", "contact_stiffness": "ke", "contact_damping": "kd"}
 """Materials of shapes by the values of a scene that they are."""
 
@@ -278,6 +269,7 @@ def _triangles(mesh: Any) -> np.ndarray:
 
 
 def _model_sizes(source: Any, kind: str, scale: np.ndarray) -> Any:
-    if kind == "hull":
-        return np.asarray(source.vertices, dtype=np.float64) * scale
-    return scale[: SIZES.get(kind, 3)]
+    if kind not in SHAPES:
+        return scale
+    sizes = SHAPES[kind].sizes
+    return np.asarray(source.vertices, dtype=np.float64) * scale if sizes is None else scale[: len(sizes)]

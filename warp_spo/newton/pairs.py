@@ -12,7 +12,7 @@ import warp as wp
 from ..errors import UnsupportedError
 from ..kernels import declare
 from ..kernels import newton_contacts as kernels
-from ..scene.contacts import GROUND_VALUES
+from ..scene.ground import GROUND_VALUES
 from ..scene.scene import Scene
 from ..scene.shape_pairs import PairSelection
 from .model_contacts import CONTACT_MATERIALS, ModelShapes

@@ -13,15 +13,17 @@ from ..errors import UnsupportedError
 from ..kernels import declare
 from ..kernels import newton_contact_slots as kernels
 from ..scene.collision_shapes import moving_bodies
-from ..scene.contacts import PLACE, Contact, Listed
+from ..scene.contact_shapes import SHAPES
+from ..scene.contacts import Contact
+from ..scene.ground import PLACE, Listed
 from ..scene.scene import Scene
 from ..status import Status
 from .model_contacts import ModelShapes
 from .pairs import ModelPairs
 from .worlds import WorldRows
 
-MOST_SLOTS = {"sphere": 4, "capsule": 4}
-"""Slots at most of shapes that touch in few points."""
+SWEPT_SLOTS = 4
+"""Slots at most of spheres and capsules, which touch in few points."""
 SLOT_VALUES = ("contact_place", "contact_friction", "contact_stiffness", "contact_damping")
 """Values of the scene that the contacts of a step are."""
 
@@ -54,7 +56,8 @@ class ContactSlots:
         for column, shape in enumerate(shapes.first()[: shapes.rows.shape[1]]):
             if shape.body < 0 or not moving[shape.body]:
                 continue
-            count = min(points, MOST_SLOTS.get(shape.kind, points))
+            few = shape.kind in SHAPES and SHAPES[shape.kind].swept
+            count = min(points, SWEPT_SLOTS) if few else points
             contacts += [Contact(shape.body, point=shape.pose[:3], label=shape.label)] * count
             columns, counts = [*columns, column], [*counts, count]
         still = [shape for shape in shapes.first() if shape.body < 0 or not moving[shape.body]]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .contacts import HEIGHTS, HeightField
+from .ground import HEIGHTS, HeightField
 from .scene import Scene
 
 HINGE = ("kind", "parent", "child", "axis", "linear", "angular", "pitch", "rotor", "flexible", "coordinates")

@@ -5,14 +5,16 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..errors import as_integer, refuse_masked
 from ..runtime.autograd import check_plain
 from .parts import IDENTITY_POSE, real
-from .scene import Scene
+
+if TYPE_CHECKING:
+    from .scene import Scene
 
 Frame = Any
 """A body (its index, label, or the label's part after the last slash), a site's name, or (one of these, pose in it)."""
@@ -117,3 +119,13 @@ def _pose(call: str, frame: Frame, pose: Any) -> tuple[float, ...]:
 
 def _wrong_frame(call: str, frame: Frame) -> TypeError:
     return TypeError(f"{call}: a frame is {frame!r}; {EXPECTED}")
+
+
+def pose_matrix(pose: np.ndarray) -> np.ndarray:
+    """Return the 4 x 4 matrix of a pose (x, y, z, qx, qy, qz, qw) with a unit quaternion."""
+    x, y, z, w = pose[3:]
+    axis, found = np.array([x, y, z]), np.eye(4)
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    found[:3, :3] = (w * w - axis @ axis) * np.eye(3) + 2.0 * np.outer(axis, axis) + 2.0 * w * across
+    found[:3, 3] = pose[:3]
+    return found

@@ -16,19 +16,10 @@ import numpy as np
 from ..errors import refuse_masked, shown
 from .actuators import RANGES, Actuator, Keyframe, actuator_values, check_actuator_value
 from .checks import SYMMETRY
-from .contacts import (
-    CONTACT_VALUES,
-    HEIGHTS,
-    Contact,
-    ContactPoint,
-    HeightField,
-    Plane,
-    check_contacts,
-    check_field,
-    contact_points,
-    contact_values,
-)
+from .contact_values import CONTACT_VALUES, contact_values
+from .contacts import Contact, ContactPoint, check_contacts, contact_points
 from .flexible.modes import MASS_VALUES, check_modes, with_modes
+from .ground import HEIGHTS, HeightField, Plane, check_field
 from .pairs import ContactPair, contact_pairs
 from .parts import (
     DOF_VALUES,

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..errors import as_integer
 from .checks import checked_array
-from .contacts import HeightField
+from .ground import HeightField
 
 SIZE, CELL = (8.0, 8.0), 0.05  # [m]
 EDGE = 0.5  # width of the flat strip along the edges [m]

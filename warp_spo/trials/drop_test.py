@@ -10,7 +10,7 @@ import warp as wp
 
 from ..dynamics.dynamics import Dynamics
 from ..scene import terrain
-from ..scene.contacts import HeightField
+from ..scene.ground import HeightField
 from ..viewing import films, shapes
 
 GROUNDS = ("flat", "rough", "stairs")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..scene.contacts import HeightField, Plane
+from ..scene.ground import HeightField, Plane
 from .shapes import Primitive
 
 SIZES = {"sphere": ("radius",), "capsule": ("radius", "half_height"), "box": ("hx", "hy", "hz")}

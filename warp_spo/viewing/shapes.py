@@ -32,7 +32,7 @@ class Primitive(NamedTuple):
 def primitives(scene: Scene, q: np.ndarray) -> tuple[Primitive, ...]:
     """Return shapes to draw, from the contacts with the ground and the joints of a scene.
 
-    Points of a contact are a sphere, a capsule or the box about them, in the body frame. A bone is a capsule from the
+    A contact is drawn as the sphere, the capsule or the box that its shape says. A bone is a capsule from the
     joint of a body to those of its children, or to the centre of mass where it has neither children nor contacts.
 
     Args:
@@ -41,8 +41,8 @@ def primitives(scene: Scene, q: np.ndarray) -> tuple[Primitive, ...]:
     radius = max(LEAST, THICK * size_of(scene, q))
     found, touching = [], {point.body for point in scene.contact_points}
     for contact in sorted({point.contact for point in scene.contact_points}):
-        points = [point for point in scene.contact_points if point.contact == contact]
-        found.append(_contact(points[0].body, np.array([p.position for p in points]), points[0].radius, radius))
+        kind, size, pose = scene.contacts[contact].shape.primitive(0.5 * radius)
+        found.append(Primitive(kind, scene.contacts[contact].body, size, pose, TOUCH))
     carried = {hinge.parent for hinge in scene.hinges}
     for hinge in scene.hinges:
         start, body = np.array(hinge.child_pose[:3]), hinge.child
@@ -81,16 +81,6 @@ def size_of(scene: Scene, q: np.ndarray) -> float:
     poses = Dynamics(scene.with_contacts([]).without_loops(), 1, "cpu", "float64").body_poses(q[None])[0]
     reach = [2.0 * (float(np.linalg.norm(point.position)) + point.radius) for point in scene.contact_points]
     return max(float(np.linalg.norm(np.ptp(poses[:, :3], axis=0))), *reach, 0.1)
-
-
-def _contact(body: int, points: np.ndarray, own: float, radius: float) -> Primitive:
-    """Return the shape about the points of a contact, of spheres of a radius ``own``."""
-    if len(points) == 1:
-        return Primitive("sphere", body, (max(own, 0.5 * radius),), (*points[0].tolist(), 0, 0, 0, 1), TOUCH)
-    if len(points) == 2:
-        return capsule(body, points[0], points[1], max(own, 0.5 * radius), TOUCH)
-    half, middle = 0.5 * np.ptp(points, axis=0) + own, 0.5 * (points.min(axis=0) + points.max(axis=0))
-    return Primitive("box", body, tuple(np.maximum(half, 1e-3).tolist()), (*middle.tolist(), 0, 0, 0, 1), TOUCH)
 
 
 def capsule(

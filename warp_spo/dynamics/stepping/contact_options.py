@@ -12,7 +12,8 @@ from ...recursions.contact import step as contact_step
 from ...recursions.contact.pair_pieces import by_limbs
 from ...recursions.contact.pairs import RESIDUAL, default_passes
 from ...runtime.arrays import Call
-from ...scene.contacts import HeightField, contact_figures
+from ...scene.contact_values import contact_figures
+from ...scene.ground import HeightField
 from ..closures import AMID_CONTACTS
 from ..operation import Argument
 from . import integrators

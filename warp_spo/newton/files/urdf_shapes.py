@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from ...scene.collision_shapes import CollisionShape
+from ...scene.contact_shapes import SHAPES, kinds_in
 from .urdf_masses import mesh_file, unit_of
 from .xml_source import XmlElement
 
-PRIMITIVES = ("sphere", "capsule", "cylinder", "box")
+KINDS = kinds_in("urdf")
+"""Kinds of shapes by the tags that stand for them."""
 
 
 def urdf_shapes(
@@ -41,7 +43,7 @@ def urdf_shapes(
             pose = np.concatenate(origin(collision))
             friction = _urdf_friction(robot, link)
             for shape in geometry:
-                if shape.tag in (*PRIMITIVES, "mesh"):
+                if shape.tag in KINDS:
                     kind, sizes, names = _urdf_sizes(shape)
                     found.append(CollisionShape(name, body, kind, pose, sizes, friction=friction, names=names))
                 else:
@@ -51,20 +53,35 @@ def urdf_shapes(
 
 def _urdf_sizes(shape: Any) -> tuple[str, Any, tuple[str, ...]]:
     """Return kind, sizes and other names of a primitive, whose axis is z, or of a mesh."""
-    size = lambda name: shape.number(name, least=0.0)  # noqa: E731
-    if shape.tag == "sphere":
-        return "sphere", (size("radius"),), ()
-    if shape.tag == "box":
-        lengths = shape.numbers("size", 3)
-        if lengths.min() < 0.0:
-            raise shape.error(f"size is {lengths.tolist()}; expected none below zero")
-        return "box", 0.5 * lengths, ()
-    if shape.tag == "mesh":
+    kind = KINDS[shape.tag]
+    sizes = SHAPES[kind].sizes
+    if sizes is None:
         file = mesh_file(shape, "because contacts= asks for its shape; choose other shapes")
         scale = unit_of(shape, file) * shape.numbers("scale", 3, (1.0, 1.0, 1.0))
-        return "hull", _vertices(shape, file) * scale, (file.stem,)
-    length = "height" if shape.tag == "capsule" and shape.get("height") is not None else "length"
-    return shape.tag, (size("radius"), 0.5 * size(length)), ()
+        return kind, _vertices(shape, file) * scale, (file.stem,)
+    return kind, tuple(READERS[size](shape) for size in sizes), ()
+
+
+def _half_length(shape: Any) -> float:
+    name = "height" if shape.tag == "capsule" and shape.get("height") is not None else "length"
+    return 0.5 * shape.number(name, least=0.0)
+
+
+def _half_sizes(shape: Any) -> np.ndarray:
+    lengths = shape.numbers("size", 3)
+    if lengths.min() < 0.0:
+        raise shape.error(f"size is {lengths.tolist()}; expected none below zero")
+    return 0.5 * lengths
+
+
+READERS: dict[str, Callable[[Any], float]] = {
+    "radius": lambda shape: shape.number("radius", least=0.0),
+    "half_length": _half_length,
+    "half_x": lambda shape: _half_sizes(shape)[0],
+    "half_y": lambda shape: _half_sizes(shape)[1],
+    "half_z": lambda shape: _half_sizes(shape)[2],
+}
+"""How each of a shape's sizes is read from its element."""
 
 
 def _vertices(shape: Any, file: Any) -> np.ndarray:

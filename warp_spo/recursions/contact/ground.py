@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...scene.contacts import AWAY, STEEP, HeightField, Listed, Plane
+from ...scene.ground import AWAY, STEEP, HeightField, Listed, Plane
 from ...trace.scalars import Graph, Value, entry, floor, inverse_root, less, lookup, select
 from ...trace.spatial import IDENTITY, Vector, dot
 

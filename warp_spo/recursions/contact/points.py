@@ -25,7 +25,8 @@ import itertools
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ...scene.contacts import AWAY, HEIGHTS, PLACE, ContactPoint, HeightField, Listed
+from ...scene.contacts import ContactPoint
+from ...scene.ground import AWAY, HEIGHTS, PLACE, HeightField, Listed
 from ...scene.scene import Scene
 from ...trace.scalars import Value, absolute, branch, is_constant, less, lost, reciprocal, select
 from ...trace.spatial import IDENTITY, ZERO, Vector, cross, dot, total

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...scene.actuators import ACTUATOR_VALUES
-from ...scene.contacts import CONTACT_VALUES, GROUND_VALUES
+from ...scene.contact_values import CONTACT_VALUES
+from ...scene.ground import GROUND_VALUES
 from ...trace.differentiation import forward, reverse
 from ...trace.emission import Store
 from ...trace.scalars import Scalar, Value, ordered

@@ -29,7 +29,8 @@ import itertools
 from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
 
-from ...scene.contacts import CONTACT_VALUES, HEIGHTS
+from ...scene.contact_values import CONTACT_VALUES
+from ...scene.ground import HEIGHTS
 from ...scene.parts import DOF_VALUES
 from ...trace.differentiation import reverse
 from ...trace.emission import Store

@@ -12,7 +12,7 @@ import itertools
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from ...scene.contacts import HEIGHTS
+from ...scene.ground import HEIGHTS
 from ...trace.emission import Store
 from ...trace.scalars import Value, cut, reciprocal, select
 from ..contact.points import TracedContactPoint, own_points, surface_numbers
