@@ -21,7 +21,7 @@ OF_SOURCES = [kind for kind, shape in SHAPES.items() if shape.names]
 def shape_of_source(kind, **more):
     """Return a shape as a reader of a file describes it."""
     sizes = SHAPES[kind].sizes
-    return Shape("", 0, kind, POSE, MESH if sizes is None else [SIZES[name] for name in sizes], **more)
+    return CollisionShape("", 0, kind, POSE, MESH if sizes is None else [SIZES[name] for name in sizes], **more)
 
 
 def lowest(contacts, direction):
