@@ -277,7 +277,7 @@ def file_agrees(scene, model, device):
 
 
 @pytest.mark.usefixtures("newtons_importer")
-@pytest.mark.parametrize("name", ["humanoid", "ant", "probe.xml"])
+@pytest.mark.parametrize("name", slow_unless(["ant", "probe.xml"], ["humanoid", "ant", "probe.xml"]))
 def test_mjcf_is_read_as_mujoco_reads_it(name, tmp_path, device):
     """Masses from shapes and densities, inertias, frames, axes, armature and gravity; Newton's two engines aside."""
     path = file_of(name, tmp_path)
@@ -286,7 +286,7 @@ def test_mjcf_is_read_as_mujoco_reads_it(name, tmp_path, device):
 
 
 @pytest.mark.parametrize("floating", [False, True], ids=["fixed", "floating"])
-@pytest.mark.parametrize("name", ["quadruped", "humanoid.urdf", "probe.urdf"])
+@pytest.mark.parametrize("name", slow_unless(["probe.urdf"], ["quadruped", "humanoid.urdf", "probe.urdf"]))
 def test_urdf_is_read_as_pinocchio_reads_it(name, floating, tmp_path, device):
     path = file_of(name, tmp_path)
     scene = spo.load(path, floating=floating)
