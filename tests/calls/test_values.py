@@ -1,5 +1,6 @@
 """Values that differ between worlds and change at run time."""
 
+import functools
 import warnings
 
 import newton
@@ -141,14 +142,18 @@ REFUSED = {
 }
 
 
+@functools.cache
+def _with_armature(device):
+    return spo.Dynamics(scene(), WORLDS, device=device, variable=("joint_armature",), granularity=of_random_scenes())
+
+
 @pytest.mark.parametrize("case", REFUSED)
 def test_refused_in_words_and_nothing_is_set(case, device):
     """A good variable value beside the bad one is not set either."""
     values, error, words = REFUSED[case]
     if device.is_cuda and case in ("dtype", "grad", "strides"):  # a mistake other than the place
         values = {name: tensor.to(wp.device_to_torch(device)) for name, tensor in values.items()}
-    more = {"granularity": of_random_scenes()}
-    dyn = spo.Dynamics(scene(), WORLDS, device=device, variable=("joint_armature",), **more)
+    dyn = _with_armature(device.alias)
     with pytest.raises(error, match="(?s)" + words):
         dyn.set(joint_armature=drawn("joint_armature", WORLDS), **values)
     assert_equals(dyn, scene(), ("mass_matrix", "forward_dynamics"))
