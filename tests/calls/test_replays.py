@@ -1,6 +1,7 @@
 """Calls that are repeated from a recording: their numbers, what they refuse, and threads that share a Dynamics."""
 
 import functools
+import itertools
 import threading
 
 import numpy as np
@@ -14,6 +15,7 @@ from support import actuated, laws, zoo
 from support.border import explained, made
 from support.laws import numbers
 from support.mechanisms import MECHANISMS
+from support.quick import slow_unless
 from warp_spo.dynamics.operation import Argument
 from warp_spo.runtime import launches
 
@@ -68,8 +70,13 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
-@pytest.mark.parametrize("kind", ["torch", "warp"])
+@pytest.mark.parametrize(
+    ("kind", "case"),
+    slow_unless(
+        [*(("torch", case) for case in CASES), ("warp", CASES[0])], itertools.product(["torch", "warp"], CASES)
+    ),
+    ids=str,
+)
 def test_every_operation_repeated_is_itself(kind, case, device):
     """Of new arrays, the bits of NumPy's call, which nobody records; results are kept, and made anew."""
     dyn, seen = dynamics(device.alias, *case), 0

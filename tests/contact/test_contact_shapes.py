@@ -8,7 +8,7 @@ from support.pair_scenes import SHAPE_ARGUMENTS
 from warp_spo.mujoco.collision_shapes import GEOMS
 from warp_spo.newton.files.urdf_shapes import READERS
 from warp_spo.newton.model_contacts import KINDS
-from warp_spo.scene.collision_shapes import Shape, contacts_of
+from warp_spo.scene.collision_shapes import CollisionShape, contacts_of
 from warp_spo.scene.contact_shapes import ARGUMENTS, SHAPES, kinds_in
 
 HALF = np.sqrt(0.5)

@@ -6,6 +6,7 @@ import warp as wp
 
 import warp_spo as spo
 from support import laws, oracles, symbolic, zoo
+from support.quick import slow_unless
 from warp_spo.recursions import articulated, hybrid
 from warp_spo.reference import dense as reference
 
@@ -48,7 +49,7 @@ def masks(scene, a):
     return {"some": a["mask"][0], "others": ~a["mask"][0], "all": [True] * dofs, "none": [False] * dofs, "device": None}
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in zoo.SCENES])
+@pytest.mark.parametrize("name", slow_unless([name for name in zoo.FEW if name not in LARGE], zoo.SCENES))
 def test_equals_the_dense_partition(name):
     scene = zoo.SCENES[name]()
     a = states(scene)
@@ -65,7 +66,7 @@ def test_equals_the_dense_partition_where_balls_are_eliminated_in_their_own_axes
         assert traced_error(scene, a, held) <= TOLERANCE["float64"], which
 
 
-@pytest.mark.parametrize("name", ["tree10", "screw_tree"])
+@pytest.mark.parametrize("name", slow_unless(["tree10"], ["tree10", "screw_tree"]))
 def test_equals_pinocchio(name):
     """Its qdd and forces fit together: aba with the forces that we say gives the accelerations that we say."""
     scene = zoo.SCENES[name]()

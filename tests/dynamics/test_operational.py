@@ -1,5 +1,7 @@
 """Operational space, momentum, the determinant's gradient and quasi-velocities against independent formulas."""
 
+import itertools
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -8,6 +10,7 @@ import warp as wp
 import warp_spo as spo
 from support import laws, oracles, robots, symbolic, zoo
 from support.allocations import no_warp_allocation
+from support.quick import slow_unless
 from warp_spo.dynamics import quasi_velocities as quasi
 from warp_spo.examples import estimation
 from warp_spo.recursions import (
@@ -27,7 +30,7 @@ WORLDS = 3
 TOLERANCE = {"float64": 1e-12, "float32": 3e-5}  # cond(M) of the worst scene is 1e4
 DIFFERENCES = 1e-10  # the gradient of log det, and C of quasi-velocities: rounding over a step of 0.01 or less
 LARGE = ("tree20", "trees25", "screw_tree", "every_d6", "floating_tree", "star")  # seconds
-SCENES = [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in zoo.SCENES]
+SCENES = slow_unless([name for name in zoo.FEW if name not in LARGE], zoo.SCENES)
 
 # name -> (arrays it takes after q, shape of the result, the reference's value for one world)
 OPERATIONS = {
@@ -207,7 +210,7 @@ def test_momentum_far_from_the_origin():
 
 
 # -- Pinocchio ---------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("name", ["tree10", "floating_tree", "one_fixed_then_revolute"])
+@pytest.mark.parametrize("name", slow_unless(["tree10"], ["tree10", "floating_tree", "one_fixed_then_revolute"]))
 def test_equals_pinocchio(name):
     scene = zoo.SCENES[name]()
     a = states(scene, 2)
@@ -345,8 +348,13 @@ def test_a_scene_that_cannot_move(device):
 
 
 # -- operational inertia -----------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-@pytest.mark.parametrize("name", ["tree20", "floating_tree", "chain7"])
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    slow_unless(
+        [("floating_tree", "float64"), ("chain7", "float32")],
+        itertools.product(["tree20", "floating_tree", "chain7"], ["float64", "float32"]),
+    ),
+)
 def test_operational_inertia(name, dtype, device):
     scene = zoo.SCENES[name]()
     frames = {"tree20": laws.frames_of(scene), "floating_tree": [0], "chain7": [6]}[name]

@@ -276,7 +276,7 @@ def file_agrees(scene, model, device):
     agrees(dyn, [model] * WORLDS, PARSED, seed=13)
 
 
-@pytest.mark.parametrize("name", ["humanoid", "ant", "probe.xml"])
+@pytest.mark.parametrize("name", slow_unless(["ant", "probe.xml"], ["humanoid", "ant", "probe.xml"]))
 def test_newtons_models_of_mjcf_are_as_mujoco_reads_the_file(name, tmp_path, device):
     """Masses from shapes and densities, inertias, frames, axes and armature, by ``from_newton``. Newton's importer
     does not read the file's gravity."""
@@ -287,7 +287,7 @@ def test_newtons_models_of_mjcf_are_as_mujoco_reads_the_file(name, tmp_path, dev
 
 
 @pytest.mark.parametrize("floating", [False, True], ids=["fixed", "floating"])
-@pytest.mark.parametrize("name", ["quadruped", "humanoid.urdf", "probe.urdf"])
+@pytest.mark.parametrize("name", slow_unless(["probe.urdf"], ["quadruped", "humanoid.urdf", "probe.urdf"]))
 def test_urdf_is_read_as_pinocchio_reads_it(name, floating, tmp_path, device):
     path = file_of(name, tmp_path)
     scene = spo.load(path, floating=floating)

@@ -166,6 +166,7 @@ def test_extended_precision_is_good_enough(name):
     assert np.linalg.norm(difference) / np.linalg.norm(wanted.astype(np.float64)) <= 1e-2 * error
 
 
+@pytest.mark.slow
 def test_forms_that_the_library_does_not_offer_are_worse(device):
     """Contrast, in float32: a full 6 x 6 P, world axes at a gimbal, the world's origin far away."""
     for name, form, factor in (

@@ -1,6 +1,7 @@
 """Tree and segment granularity: every traced operation against the dense reference, on scenes with all there is."""
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -21,6 +22,7 @@ from support.granularity_scenes import (
     equals_reference,
     states,
 )
+from support.quick import slow_unless
 from support.routines import ROUTINES
 
 
@@ -32,7 +34,7 @@ def cases():
             for dtype in DTYPES:
                 for operation in OPERATIONS if granularity == "tree" else (*SEGMENTED, "bias_force"):
                     quick = dtype == QUICK[name][0] and operation in QUICK[name][1]
-                    marks = [] if quick and (name, granularity) != ("deep", "segment") else [pytest.mark.slow]
+                    marks = [] if quick else [pytest.mark.slow]
                     found.append(pytest.param(name, granularity, dtype, operation, marks=marks))
     return found
 
@@ -140,8 +142,13 @@ def test_body_states_are_poses_and_velocities(name, granularity, device):
         dyn.body_states(a["q"], a["qd"], out=out[0])
 
 
-@pytest.mark.parametrize("granularity", GRANULARITIES)
-@pytest.mark.parametrize("name", [pytest.param("every kind", marks=pytest.mark.slow), "fixed", "hand", "massless"])
+@pytest.mark.parametrize(
+    ("name", "granularity"),
+    slow_unless(
+        [("fixed", "tree"), ("fixed", "segment"), ("massless", "segment")],
+        itertools.product(["every kind", "fixed", "hand", "massless"], GRANULARITIES),
+    ),
+)
 def test_velocity_terms_first(name, granularity, device):
     """Forward dynamics as the plan has it for many worlds on a GPU: bias forces, then the solution; with loads."""
     scene = SCENES[name]()

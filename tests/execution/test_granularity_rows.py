@@ -1,5 +1,6 @@
 """Tree and segment granularity: rows of arrays that shared memory cannot hold or that begin anywhere."""
 
+import itertools
 import math
 
 import numpy as np
@@ -9,6 +10,7 @@ import warp as wp
 import warp_spo as spo
 from support import laws, warp_machine, zoo
 from support.granularity_scenes import DTYPES, GRANULARITIES, MANY, dynamics, equals_reference, states
+from support.quick import slow_unless
 from warp_spo.execution import plan
 from warp_spo.kernels import straight_line
 
@@ -25,9 +27,14 @@ def test_a_long_result_that_shared_memory_cannot_hold(granularity, device, monke
     assert {text.frame.result.way for text in texts} == {straight_line.RELAYED}
 
 
-@pytest.mark.parametrize("way", [straight_line.MAPPED, straight_line.RELAYED])
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("granularity", GRANULARITIES)
+@pytest.mark.parametrize(
+    ("granularity", "dtype", "way"),
+    slow_unless(
+        [("tree", "float32", straight_line.MAPPED), ("tree", "float64", straight_line.RELAYED),
+         ("segment", "float32", straight_line.RELAYED), ("segment", "float64", straight_line.MAPPED)],
+        itertools.product(GRANULARITIES, DTYPES, [straight_line.MAPPED, straight_line.RELAYED]),
+    ),
+)  # fmt: skip
 def test_long_results_that_begin_anywhere(granularity, dtype, way, device, monkeypatch):
     """Of worlds that fill no warp, no tile and no 16 bytes; nothing is written in front of the result or behind it."""
     operation = "mass_matrix" if granularity == "tree" else "mass_matrix_inverse"
@@ -54,8 +61,13 @@ def test_long_results_that_begin_anywhere(granularity, dtype, way, device, monke
     assert found == {(way, 1 if granularity == "tree" else 2)}
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("name", ["chain_helical", "chain_universal"])
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    slow_unless(
+        [("chain_helical", "float32"), ("chain_universal", "float64")],
+        itertools.product(["chain_helical", "chain_universal"], DTYPES),
+    ),
+)
 def test_rows_that_begin_anywhere(name, dtype, device, monkeypatch):
     """Rows come in and out 16 bytes at a time where memory allows it; slices begin between such places."""
     for limit in ("FEW_WORLDS", "SHORT_ROWS", "LONG_ROWS"):

@@ -1,6 +1,7 @@
 """Tree and segment granularity: values that are variable, folded, or set later."""
 
 import functools
+import itertools
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 import warp_spo as spo
 from support import laws, zoo
 from support.granularity_scenes import GRANULARITIES, OPERATIONS, SEGMENTED, equals_reference, poisoned, states
+from support.quick import slow_unless
 
 VARIABLE = ("body_mass", "body_com", "body_inertia", "joint_armature", "gravity", "joint_X_p", "joint_X_c")
 
@@ -24,8 +26,13 @@ def changed(scene, name, worlds, seed=0):
     return values * 1.5 if name in ("body_mass", "body_inertia", "gravity") else values
 
 
-@pytest.mark.parametrize("granularity", GRANULARITIES)
-@pytest.mark.parametrize("name", VARIABLE)
+@pytest.mark.parametrize(
+    ("name", "granularity"),
+    slow_unless(
+        [*itertools.product(VARIABLE, ["tree"]), ("body_mass", "segment"), ("joint_X_p", "segment")],
+        itertools.product(VARIABLE, GRANULARITIES),
+    ),
+)
 def test_a_variable_value_set_afterwards(name, granularity, device):
     """Before and after ``set``; a program compiled before reads the new value."""
     scene, worlds = small(), 3

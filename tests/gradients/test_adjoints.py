@@ -1,6 +1,7 @@
 """Products J* y by limbs side by side and by whole trees, against the dense derivatives of another recursion."""
 
 import functools
+import itertools
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import warp as wp
 import warp_spo as spo
 from support import laws, symbolic, warp_machine, zoo
 from support.granularity_scenes import hand
+from support.quick import slow_unless
 from support.routines import ROUTINES
 from warp_spo.execution import plan
 from warp_spo.kernels import straight_line
@@ -79,8 +81,16 @@ def test_forward_dynamics(name, dtype, granularity, device):
     assert any("segment" in line for line in lines) == (granularity == "segment")
 
 
-@pytest.mark.parametrize("few", [0, plan.FEW_WORLDS])
-@pytest.mark.parametrize("wrt", [("qd", "q"), ("tau",), ("tau", "tangent"), ("body_f", "q")])
+WRT = (("qd", "q"), ("tau",), ("tau", "tangent"), ("body_f", "q"))
+
+
+@pytest.mark.parametrize(
+    ("wrt", "few"),
+    slow_unless(
+        [*itertools.product(WRT, [0]), (("body_f", "q"), plan.FEW_WORLDS)],
+        itertools.product(WRT, [0, plan.FEW_WORLDS]),
+    ),
+)
 def test_what_is_asked_for_by_limbs(wrt, few, device, monkeypatch):
     """Any part of it, in any order, is what a thread for the whole tree gives; values differ between worlds."""
     monkeypatch.setattr(plan, "FEW_WORLDS", few)  # both solutions in two kernels, or in one
@@ -118,8 +128,10 @@ def test_a_world_without_a_solution_stays_alone(device):
 
 
 # -- warps -------------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("staged", [False, True])
-@pytest.mark.parametrize("name", WARPS)
+@pytest.mark.parametrize(
+    ("name", "staged"),
+    slow_unless([("limbs", False), ("fork", True), ("hand", False)], itertools.product(WARPS, [False, True])),
+)
 def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
     """The CUDA text of both kernels, warp by warp in either order, with rows and results in shared memory or not."""
     for limit in ("FEW_WORLDS", "LONG_ROWS") if staged else ():

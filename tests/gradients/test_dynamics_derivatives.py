@@ -1,6 +1,7 @@
 """Analytic derivatives of the dynamics against Pinocchio's, and against central differences of the dense reference."""
 
 import functools
+import itertools
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import warp_spo as spo
 from benchmarks.table import cases
 from support import laws, oracles, symbolic, warp_machine, zoo
 from support.allocations import no_warp_allocation
+from support.quick import slow_unless
 from support.robots import ROBOTS
 from support.routines import ROUTINES
 from support.segments_of_trees import TREES
@@ -25,6 +27,8 @@ SAME_NUMBERS = 1e-9  # float64 against Pinocchio; measured 6e-14
 FLOAT32 = 2e-5  # grows with the condition of Mass, up to 1e4 here; measured 2e-6
 SCENES = ["one_ball", "one_free", "chain_helical", "chain_free", "chain_planar", "fork", "forest", "tree10", "plain"]
 LARGE = ["every_d6", "floating_tree", "trees25", "arm"]  # the dense reference takes long
+LOADED = ("qd", "qdd", "body_f")
+QUICK = ["chain_helical", "chain_free", "forest", "tree10"]
 
 
 @functools.cache
@@ -70,17 +74,23 @@ def by_differences(scene, a, world, inverse_dynamics=True):
     return by_q, difference(lambda qd: value(here, qd), lambda e, h: s["qd"] + h * e, units)
 
 
+@functools.cache
+def inverse_by_differences(name):
+    """As :func:`by_differences`, of a state of the scene ``name``."""
+    return by_differences(scene_of(name), laws.states(scene_of(name), 1), 0)
+
+
 # -- inverse dynamics --------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", slow_unless(QUICK, SCENES))
 def test_inverse_dynamics_by_central_differences(name):
     scene = scene_of(name)
     a = laws.states(scene, 1)
-    wanted = (*by_differences(scene, a, 0), Dense(scene, a["q"][0]).mass_matrix)
+    wanted = (*inverse_by_differences(name), Dense(scene, a["q"][0]).mass_matrix)
     for ours, right in zip(inverse(scene, a)[:, 0], wanted, strict=True):
         assert laws.error(ours, right) <= DIFFERENCES
 
 
-@pytest.mark.parametrize("name", [*SCENES, *LARGE])
+@pytest.mark.parametrize("name", slow_unless(QUICK, [*SCENES, *LARGE]))
 def test_inverse_dynamics_is_pinocchios(name):
     scene = without_outer_armature(scene_of(name))
     a, oracle = laws.states(scene, 2), oracles.PinocchioModel(scene)
@@ -99,7 +109,7 @@ def test_what_is_not_given_is_zero(given):
     np.testing.assert_allclose(inverse(scene, a, ("q", *given)), inverse(scene, less), rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", slow_unless(QUICK, SCENES))
 def test_mass_matrix_derivative_by_central_differences(name):
     scene = scene_of(name)
     a, n = laws.states(scene, 1), scene.dof_count
@@ -109,8 +119,12 @@ def test_mass_matrix_derivative_by_central_differences(name):
     assert laws.error(got, wanted) <= DIFFERENCES
 
 
-@pytest.mark.parametrize("given", [("qd", "qdd", "body_f"), ("qdd",)])
-@pytest.mark.parametrize("name", ["fork", "comb", "forest"])
+@pytest.mark.parametrize(
+    ("name", "given"),
+    slow_unless(
+        [("fork", LOADED), ("comb", ("qdd",))], itertools.product(["fork", "comb", "forest"], [LOADED, ("qdd",)])
+    ),
+)
 def test_limbs_side_by_side(name, given, monkeypatch):
     """The CUDA text, warp by warp in either order, gives what one thread gives for the whole tree."""
     monkeypatch.setattr(straight_line, "SHARED_BYTES", 1 << 20)
@@ -351,11 +365,11 @@ BUGS = {
 
 @pytest.mark.parametrize("bug", BUGS)
 def test_a_planted_bug_is_seen(bug, monkeypatch):
-    scene = scene_of("chain_helical" if "slide" in bug else "forest" if "sign" in bug else "chain_free")
+    name = "chain_helical" if "slide" in bug else "forest" if "sign" in bug else "chain_free"
+    scene, wanted = scene_of(name), inverse_by_differences(name)
     a = laws.states(scene, 1)
     symbolic.plant(monkeypatch, *BUGS[bug])
     got = inverse(scene, a)
-    wanted = by_differences(scene, a, 0)
     assert max(laws.error(got[i, 0], wanted[i]) for i in range(2)) > 1e-3
 
 

@@ -67,7 +67,7 @@ def gradients(robot, device, dtype, steps):
     return [g.cpu().double() for g in torch.autograd.grad(loss(dyn, steps, *tensors), tensors)]
 
 
-@pytest.mark.parametrize("steps", [50, 500])
+@pytest.mark.parametrize("steps", [50, pytest.param(500, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_gradient_of_a_rollout_is_the_difference(robot, device, steps):
     """Along each gradient and a random direction at once, by four points: what is left is rounding."""
@@ -85,7 +85,7 @@ def test_gradient_of_a_rollout_is_the_difference(robot, device, steps):
         assert abs(slope - wanted) <= TOLERANCE["float64", steps] * abs(slope), name
 
 
-@pytest.mark.parametrize("steps", [50, 500])
+@pytest.mark.parametrize("steps", [50, pytest.param(500, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_gradient_of_a_rollout_in_float32(robot, device, steps):
     single, double = (gradients(robot, device.alias, dtype, steps) for dtype in ("float32", "float64"))

@@ -13,7 +13,7 @@ from warp_spo.reference import dense as reference
 
 
 @pytest.mark.parametrize("delta", [True, False])
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_equation_1_of_abstract_systems(seed, delta, device):
     """Non-uniform, non-square, non-invertible weights: the identities know nothing of bodies."""
     rng = np.random.default_rng(seed)

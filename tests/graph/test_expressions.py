@@ -1,5 +1,6 @@
 """Expressions of spatial operators: each is one kernel that equals the expression's dense matrix."""
 
+import itertools
 import warnings
 
 import numpy as np
@@ -10,6 +11,7 @@ import warp_spo as spo
 from support import laws, warp_machine, zoo
 from support.allocations import no_warp_allocation
 from support.operators_of_robots import IDENTITY, SCENES, close, fused, inverse_mass, scene_of, traced
+from support.quick import slow_unless
 from warp_spo.execution.staging import is_read_before_written
 from warp_spo.reference import dense as reference
 from warp_spo.trace.emission import Store
@@ -34,8 +36,10 @@ EXPRESSIONS = {
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.slow if name in ("trees25", "tree20", "tall_humanoid") else ())
-        for name in (*SCENES, "chain_helical", "chain_ball", "trees25")
+        *slow_unless(
+            ("arm", "forest", "chain_free", "chain_helical"),
+            (*SCENES, "chain_helical", "chain_ball", "trees25"),
+        )
     ],
 )
 def test_traces_equal_the_reference(name, device):
@@ -54,9 +58,13 @@ def test_traces_equal_the_reference(name, device):
         assert laws.error(got, np.linalg.solve(dense[world].mass_matrix, x[world])) <= IDENTITY["float64"]
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-@pytest.mark.parametrize("worlds", [1, 3, 33])
-@pytest.mark.parametrize("name", ["tree10", pytest.param("tree20", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("name", "worlds", "dtype"),
+    slow_unless(
+        [("tree10", 3, "float64"), ("tree10", 33, "float32")],
+        itertools.product(["tree10", "tree20"], [1, 3, 33], ["float64", "float32"]),
+    ),
+)
 def test_kernels_equal_the_reference_and_node_granularity(name, worlds, dtype, device):
     scene = scene_of(name)
     dyn, ops, q = fused(name, worlds, device, dtype)

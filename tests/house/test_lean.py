@@ -1,5 +1,7 @@
 """A scene pays for what it has: operations, arrays and kernel arguments of its programs, counted."""
 
+import itertools
+
 import numpy as np
 import pytest
 import warp as wp
@@ -7,6 +9,7 @@ import warp as wp
 import warp_spo as spo
 from benchmarks.table import cases
 from support import laws, zoo
+from support.quick import slow_unless
 from support.routines import ROUTINES
 from warp_spo.execution.parameters import VARIABLE
 from warp_spo.recursions.model.links import MOTION_VALUES
@@ -60,8 +63,12 @@ LESS = {
 ONLY = {"no gravity": ("forward_dynamics", "inverse_dynamics"), "no armature": ("inverse_dynamics", "mass_matrix")}
 
 
-@pytest.mark.parametrize("granularity", ["tree", "segment"])
-@pytest.mark.parametrize("less", LESS)
+@pytest.mark.parametrize(
+    ("less", "granularity"),
+    slow_unless(
+        [*itertools.product(LESS, ["tree"]), ("aligned axes", "segment")], itertools.product(LESS, ["tree", "segment"])
+    ),
+)
 def test_less_costs_less(less, granularity):
     """Of two arms side by side on aligned axes, so that nothing else hides what is saved; every operation counts."""
     generic = dict(axes=np.eye(3)[[2, 1]]) if less == "diagonal inertias" else {}
@@ -137,6 +144,9 @@ def test_what_varies_is_an_argument_and_nothing_else(name):
     assert found.fields == (("value",) if name in MOTION_VALUES else ())
     arguments = [argument.label for argument in found.kernel.adj.args]
     assert set(arguments) == {"worlds", "q", "qd", "tau", "out", *found.fields}
+
+
+def test_nothing_that_varies_is_no_argument():
     assert program(arm(), "forward_dynamics").fields == ()
 
 

@@ -125,7 +125,7 @@ WEIGHTLESS = [
 
 
 @pytest.mark.parametrize("laws_of_it", WEIGHTLESS, ids=lambda given: "-".join(given))
-@pytest.mark.parametrize("count", [2, 12])
+@pytest.mark.parametrize("count", [2, pytest.param(12, marks=pytest.mark.slow)])
 def test_what_moves_nothing_is_where_its_forces_balance(laws_of_it, count):
     """No mass, no armature: a step is solved wherever a law holds the hinge, though at its start all are at their
     bounds; NaN where it pulls beyond them. In joint space, and by sweeps."""

@@ -1,6 +1,7 @@
 """Time steps by limbs side by side: the dense nonlinear equation, the step by whole trees, and warps that vote."""
 
 import functools
+import itertools
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import warp as wp
 import warp_spo as spo
 from support import actuated, implicit, laws, symbolic, warp_machine, zoo
 from support.granularity_scenes import MANY, hand
+from support.quick import slow_unless
 from support.routines import ROUTINES
 from support.step_scenes import FORCES, TOLERANCE, H, furnished, states
 from warp_spo.execution import plan
@@ -150,8 +152,13 @@ def texts_of(monkeypatch, name, staged=False, substeps=None, **options):
     return texts[-1], a | numbers, symbolic.advance(scene, a, H)
 
 
-@pytest.mark.parametrize("staged", [False, True])
-@pytest.mark.parametrize("name", [*SCENES, "still", "driven"])
+@pytest.mark.parametrize(
+    ("name", "staged"),
+    slow_unless(
+        [("hand", False), ("fork", True), ("roots", False), ("still", True), ("driven", False)],
+        itertools.product([*SCENES, "still", "driven"], [False, True]),
+    ),
+)
 def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
     """Warp by warp in either order, written over the state; worlds need different numbers of passes."""
     text, a, (q, qd, passes) = texts_of(monkeypatch, name, staged, qdd=True, status=True)
@@ -183,8 +190,9 @@ def test_the_step_writes_the_states_of_bodies(name, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("most", [0, 1 << 10])
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    ("name", "most"), slow_unless([("hand", 0), ("roots", 1 << 10)], itertools.product(SCENES, [0, 1 << 10]))
+)
 def test_warps_take_turns(name, most, monkeypatch):
     """Laws and checks in loops, and in statements."""
     monkeypatch.setattr(steps, "MOST_LAWS", most)

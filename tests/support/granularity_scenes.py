@@ -142,7 +142,7 @@ QUICK = {
     "fixed": ("float64", OPERATIONS),
     "hand": ("float32", OF_HAND),
     "mirrored": ("float32", FORWARD),
-    "deep": ("float32", FORWARD),
+    "deep": ("float32", ()),  # seconds
     "massless": ("float32", FORWARD),
     "no armature": ("float64", FORWARD),
     "isotropic armature": ("float64", (*FORWARD, "solve_mass_matrix")),

@@ -59,8 +59,7 @@ SAME = {  # operation -> (arrays, {result: shape}, options)
 }  # fmt: skip
 
 QUICK = [name for name in SAME if name not in (
-    "mass_matrix_inverse", "log_det_mass_matrix_gradient", "inverse_dynamics_derivatives", "solve_mass_matrix_vjp",
-    "hybrid_dynamics", "operational_inertia_inverse", "body_reactions", "quasi_velocity_coriolis"
+    "mass_matrix_inverse", "solve_mass_matrix_vjp", "operational_inertia_inverse", "body_reactions"
 )]  # fmt: skip
 """Operations of a quick run. The others take seconds and ask a hinge for nothing that these do not ask it for."""
 

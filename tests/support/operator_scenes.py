@@ -209,9 +209,10 @@ CASES = [
     (operator, scene)
     for operator in OPERATORS
     for scene in SCENES
-    if operator in ON_EVERY_GRAPH or scene in ("random", "digraph")
+    if operator in ON_EVERY_GRAPH or scene in ("random", "digraph") or (operator, scene) == ("blocks", "single")
 ]
-"""(operator, graph): every operator on a forest and on a graph whose nodes have several parents."""
+"""(operator, graph): every operator on a forest and on a graph whose nodes have several parents, and an operator that
+has no columns."""
 
 every = pytest.mark.parametrize("operator", OPERATORS)
 everywhere = pytest.mark.parametrize("scene", SCENES)

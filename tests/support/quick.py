@@ -10,7 +10,7 @@ def slow_unless(quick, values):
         quick: values that a quick run takes; each must be one of ``values``.
         values: all values; tuples are parameters of several arguments.
     """
-    values = list(values)
+    quick, values = list(quick), list(values)
     unknown = [value for value in quick if value not in values]
     assert not unknown, f"slow_unless: {unknown} are no parameters of the test; expected some of {values}"
     return [

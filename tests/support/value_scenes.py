@@ -6,8 +6,6 @@ import warnings
 
 import numpy as np
 
-from warp_spo.reference import dense as reference
-
 from . import laws, zoo
 from .laws import OPERATIONS, TOLERANCE
 
@@ -56,7 +54,7 @@ def assert_equals(dyn, expected_scene, operations=OPERATIONS, tolerance=None):
     results = {operation: laws.numpy_call(dyn, operation, arrays) for operation in operations}
     for world in range(dyn.worlds):
         state = {name: array[world] for name, array in arrays.items()} | {"frames": laws.frames_of(expected_scene)}
-        dense = reference.Dense(expected_scene, state["q"], world=world)
+        dense = laws.dense(expected_scene, state["q"], world)
         for operation in operations:
             wanted = np.asarray(OPERATIONS[operation][1](dense, state))
             value = laws.same_quaternion_sign(operation, expected_scene, results[operation][world], wanted)
