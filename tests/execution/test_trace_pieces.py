@@ -13,6 +13,7 @@ from support.robots import ROBOTS
 from support.routines import ROUTINES
 from warp_spo.execution import plan
 from warp_spo.execution.segment import shared_code as shared_text
+from warp_spo.execution.segment.schedule import Schedule
 from warp_spo.kernels import straight_line as straight
 from warp_spo.recursions.model import shared_constants as alike
 from warp_spo.recursions.model.links import Links
@@ -32,18 +33,21 @@ def test_pieces_are_segments(name):
             assert link.parent is over and len(over.children) == 1
         assert len(piece.children) != 1 and len(piece.children) == len(piece.links[-1].children)
         assert all(child.index > piece.index and child.links[0].parent is piece.links[-1] for child in piece.children)
-    leaves = [piece.warp for piece in pieces.pieces if not piece.children]
-    assert sorted(leaves) == [*range(pieces.warps)]
+    schedule = Schedule(pieces)
+    leaves = [schedule.assignments[piece.index].warp for piece in pieces.leaves]
+    assert sorted(leaves) == [*range(schedule.warps)]
 
 
 @pytest.mark.parametrize("name", TREES)
 def test_pieces_wait_for_each_other(name):
     """A warp reads results of other warps only from earlier stages; within a warp, inward comes before outward."""
-    for piece in (pieces := Pieces(Links(TREES[name]()))).pieces:
-        assert 0 <= piece.inward <= piece.outward < pieces.stages
-        for child in piece.children:
-            assert child.inward + (child.warp != piece.warp) <= piece.inward
-            assert piece.outward + (child.warp != piece.warp) <= child.outward
+    schedule = Schedule(Pieces(Links(TREES[name]())))
+    for piece in schedule.segments.pieces:
+        own = schedule.assignments[piece.index]
+        assert 0 <= own.inward <= own.outward < schedule.stages
+        for child in (schedule.assignments[one.index] for one in piece.children):
+            assert child.inward + (child.warp != own.warp) <= own.inward
+            assert own.outward + (child.warp != own.warp) <= child.outward
 
 
 SEGMENTED = {"forward_dynamics": ("qd", "tau", "body_f"), "inverse_dynamics": ("qd", "qdd", "body_f"),

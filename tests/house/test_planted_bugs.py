@@ -10,6 +10,7 @@ from support.mutants import mutant
 from support.routines import ROUTINES
 from warp_spo.execution.node import functions as node_functions
 from warp_spo.execution.node import sweeps as levels
+from warp_spo.execution.segment import schedule
 from warp_spo.execution.segment import shared_code as shared_text
 from warp_spo.execution.segment import warp_specialized as teams
 from warp_spo.graph import blocks
@@ -180,10 +181,12 @@ def team_error(monkeypatch, operation="forward_dynamics", name="star"):
 
 TEAM_MUTANTS = {
     "a slot too near": (messages, "slots", "at += size(letter, piece)", "at += size(letter, piece) - 1"),
-    "no barrier before the trunk": (pieces.Pieces, "_hand_over",
-                                    "child.inward + (child.warp != piece.warp)", "child.inward"),
-    "no barrier after the trunk": (pieces.Pieces, "__init__",
-                                   "piece.parent.outward + (piece.warp != piece.parent.warp)", "piece.parent.outward"),
+    "no barrier before the trunk": (schedule.Schedule, "_hand_over",
+                                    "inward[child.index] + (warp[child.index] != warp[piece.index])",
+                                    "inward[child.index]"),
+    "no barrier after the trunk": (schedule.Schedule, "_outward_stages",
+                                   "stages[above.index] + (self._warp[piece.index] != self._warp[above.index])",
+                                   "stages[above.index]"),
     "another limb's entries": (shared_text.SharedText, "_distances", "who * {step}", "who * {step + 1}"),
     "another limb's constants": (shared_text.SharedText, "merge", "zip(*constants.columns, strict=True)",
                                  "[*zip(*constants.columns, strict=True)][::-1]"),

@@ -8,11 +8,12 @@ import itertools
 from ..errors import UnsupportedError
 from ..kernels.long_results import WARP_SIZE
 from ..recursions.model.links import Links
-from ..recursions.model.segments import PARTS, Pieces
+from ..recursions.model.segments import Pieces
 from ..scene.scene import Scene
 from .device_facts import RESERVED, DeviceFacts
 from .node.path_blocks import cut, solid_nodes
 from .routine import Routine
+from .segment.schedule import PARTS
 from .tuned import Tuned
 
 SHARED, ASKED = "links share dofs", "asked for"
@@ -248,7 +249,7 @@ def choose(
     asked = "tree" if shared else granularity or ("node" if recursion == "scan" else DEFAULT)
     side_by_side = device.cuda and not shared and asked != "node" and 0 < scene.dof_count <= MOST_DOFS
     pieces = Pieces(Links(scene)) if side_by_side else None
-    limbs, alike = (pieces.warps, pieces.alike >= ALIKE[dtype]) if pieces else (1, True)
+    limbs, alike = (len(pieces.leaves), pieces.alike >= ALIKE[dtype]) if pieces else (1, True)
     serial = pieces is not None and pieces.serial >= SERIAL
     rule = _choose_by_rule(scene.dof_count, limbs, alike, serial, worlds, device, dtype, varies)
     chosen, reason = (asked, ASKED) if asked else rule

@@ -153,7 +153,7 @@ class Programs:
         pieces = Pieces(links) if ways else None
         for way in ways:
             assert pieces is not None
-            if 1 < pieces.warps <= MOST_WARPS or way["alone"]:
+            if 1 < len(pieces.leaves) <= MOST_WARPS or way["alone"]:
                 program = segment_programs.build(self.builder, job, pieces, **way)
                 if program is not None:
                     return program

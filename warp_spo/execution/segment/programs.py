@@ -21,7 +21,7 @@ from ...recursions.contact.secant_laws import SECANT
 from ...recursions.model import messages
 from ...recursions.model import shared_constants as alike
 from ...recursions.model.messages import INWARD, OUTWARD
-from ...recursions.model.segments import PARTS, Piece, Pieces
+from ...recursions.model.segments import Piece, Pieces
 from ...recursions.model.tracing import Trace
 from ...recursions.step.step import FORCE, GAIN, GUESS, MISSED, RESISTANCE
 from ...trace.emission import Emitter, Store, under
@@ -31,6 +31,7 @@ from .. import staging
 from ..array_access import make_emitter
 from ..builder import Builder, Job, Program, flatten
 from ..device_facts import RESERVED
+from .schedule import PARTS, Schedule
 from .warp_specialized import HELD, Passes, Team, Work
 
 MOST_REGISTERS = 255  # of a thread
@@ -100,6 +101,7 @@ class _Limbs:
     def __init__(self, builder: Builder, job: Job, pieces: Pieces, alone: bool, local: bool):
         self.builder, self.job, self.pieces, self.alone, self.local = builder, job, pieces, alone, local
         self.run, self.plan, self.dtype = builder.run, builder.plan, builder.dtype
+        self.schedule = Schedule(pieces)
         self.letters = messages.needed(job.routine.letters, job.shapes)
         self.slots, self.sent = messages.slots(self.letters, pieces)
         self.couples = self._couples() if job.routine.couples else None
@@ -121,7 +123,8 @@ class _Limbs:
         links = self.builder.links
         seats = pair_pieces.seats_of(links, pieces := Pieces(links))
         alpha = -1 if seats is None or seats.base is None else self.slots["a", seats.base.index]
-        return pair_pieces.team(links, pieces, alpha, self.sent)
+        warps = [assigned.warp for assigned in self.schedule.assignments]
+        return pair_pieces.team(links, pieces, alpha, self.sent, warps)
 
     # -- the work of each piece ------------------------------------------------------------------------------------
     def _trace(self, index: int, unfolded: frozenset) -> Traced:
@@ -155,7 +158,7 @@ class _Limbs:
 
     def _gather(self, unfolded: list[frozenset]) -> Gathered | None:
         """Return the work of all pieces, None if there is no room; ``unfolded``: by piece, see :meth:`_trace`."""
-        job, pieces = self.job, self.pieces
+        job, pieces, schedule = self.job, self.pieces, self.schedule
         routine = job.routine
         traced = [self._trace(index, unfolded[index]) for index in range(len(pieces.pieces))]
         everything = [item for one in traced for item in one.everything]
@@ -163,14 +166,14 @@ class _Limbs:
         if not (bends or routine.counted):
             traced = [one._replace(held=[]) for one in traced]
         passes = self._passes(traced, bends)
-        sent = self.sent + (2 * pieces.warps if bends else 0)
+        sent = self.sent + (2 * schedule.warps if bends else 0)
         whole = [item for item in everything if item.array == "out"]
-        warps = 1 if self.alone else pieces.warps
+        warps = 1 if self.alone else schedule.warps
         layout = self.builder.layout(job, whole, everything, 0 if self.local else sent, warps)
         if not self._fits(layout):
             return None
         declared = "" if self.couples is None else coupling_teams.declare(self.couples, self.run.dtype, self.local)
-        team = Team(pieces, self.dtype, passes, declared)
+        team = Team(schedule, self.dtype, passes, declared)
         outs = [[item for item in one.stores if item.array == "out"] for one in traced]
         placed, table = staging.arrange_stores(whole, layout.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
@@ -234,7 +237,9 @@ class _Limbs:
         rounds = [later.branch(by_slot(turn)) for turn in one.rounds]
         laws, checks = [ruling.branch(turn) for turn in one.laws], [checking.branch(turn) for turn in one.checks]
         emitters = {first, sweeps, later, ruling, checking}
-        work = Work(piece, sweep, back, laws, checks, news, rounds, ahead, couples)
+        work = Work(
+            piece, self.schedule.assignments[piece.index], sweep, back, laws, checks, news, rounds, ahead, couples
+        )
         team.add(work, sum(each.operations for each in emitters))
         return any(each.counts["lookup"] for each in emitters)
 
@@ -262,10 +267,10 @@ class _Limbs:
 
     def _registers(self, layout: KernelLayout) -> int:
         """Return how many registers a thread may take, so that a multiprocessor holds as many blocks as help."""
-        warps = 1 if self.alone else self.pieces.warps
+        warps = 1 if self.alone else self.schedule.warps
         if self.dtype == "float32" and not self.plan.few:
             for blocks, enough in self.job.routine.occupancy:
-                fewer = self._shared_registers(blocks * self.pieces.warps)
+                fewer = self._shared_registers(blocks * self.schedule.warps)
                 room = blocks * (layout.shared_bytes(self.run.dtype) + RESERVED) <= self.plan.device.shared_bytes
                 if fewer >= enough and room:
                     return fewer

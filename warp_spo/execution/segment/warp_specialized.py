@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 from ...kernels import pass_loops
 from ...recursions.contact.secant_laws import SECANT
-from ...recursions.model.segments import Piece, Pieces
+from ...recursions.model.segments import Piece
 from ...trace.emission import C_TYPE, Listing, render
+from .schedule import Assignment, Schedule
 from .shared_code import SharedText, any_of, choose
 
 HELD = "held"
@@ -24,6 +25,7 @@ class Work(NamedTuple):
 
     Attributes:
         piece: the piece.
+        assigned: the warp that works on it, and the stages of its sweeps.
         inward: the inward sweep.
         outward: the outward sweep.
         laws: what comes before the inward sweep of a pass, in turns of which many may be alike.
@@ -36,6 +38,7 @@ class Work(NamedTuple):
     """
 
     piece: Piece
+    assigned: Assignment
     inward: Listing
     outward: Listing
     laws: Sequence[Listing]
@@ -96,7 +99,7 @@ class Team:
     """The work of all pieces of a scene, and the kernel text made of it.
 
     Args:
-        pieces: the pieces.
+        schedule: warps and stages of the pieces.
         dtype: the scalar type, "float32" or "float64".
         passes: the team repeats its work in passes; None if it does not.
         pairs: the definition of ``team_coupling``, which couples pairs of bodies; "" if there are none.
@@ -105,9 +108,10 @@ class Team:
         shared: the texts that its warps share, and their tables.
     """
 
-    def __init__(self, pieces: Pieces, dtype: str, passes: Passes | None = None, pairs: str = ""):
+    def __init__(self, schedule: Schedule, dtype: str, passes: Passes | None = None, pairs: str = ""):
         self.pairs = pairs
-        self.pieces, self.dtype, self.c, self.passes = pieces, dtype, C_TYPE[dtype], passes
+        self.schedule, self.pieces, self.passes = schedule, schedule.segments.pieces, passes
+        self.dtype, self.c = dtype, C_TYPE[dtype]
         self.shared = SharedText(dtype)
         self._work: dict[int, Work] = {}
 
@@ -119,7 +123,7 @@ class Team:
     @property
     def texts(self) -> list[tuple[str, ...]]:
         """The texts that are equal for pieces that share their code, by piece."""
-        return [self._work[piece.index].text for piece in self.pieces.pieces]
+        return [self._work[piece.index].text for piece in self.pieces]
 
     @property
     def _definitions(self) -> list[str]:
@@ -130,10 +134,10 @@ class Team:
         """The last stage that has statements."""
         stages = [0]
         for work in self._work.values():
-            stages += [work.piece.inward] if work.inward.text else []
-            stages += [work.piece.outward] if work.outward.text else []
+            stages += [work.assigned.inward] if work.inward.text else []
+            stages += [work.assigned.outward] if work.outward.text else []
             if work.rounds and not self.passes:
-                stages.append(self.pieces.stages - 1)  # inner pieces read the news in the last stage
+                stages.append(self.schedule.stages - 1)  # inner pieces read the news in the last stage
         return max(stages)
 
     def cpu(self) -> str:
@@ -141,23 +145,23 @@ class Team:
         text: list[str] = []
         later: list[str] = []
         for stage in range(self._last + 1):
-            for piece in reversed(self.pieces.pieces):
-                if piece.inward == stage:
+            for piece in reversed(self.pieces):
+                if self._work[piece.index].assigned.inward == stage:
                     text += [self._branch(piece, each) for each in self._work[piece.index].laws]
                     text.append(render(self._work[piece.index].inward, self.dtype, f"p{piece.index}_"))
                     responses = [self._branch(piece, each) for each in self._work[piece.index].couples]
                     text += ["if (coupled) {", *responses, "}"] if responses else []
             text += [couple_pairs("0", 1)] if self.pairs and stage == 0 else []
             text += [release_pairs("0", 1)] if self.pairs and stage == self._last else []
-            for piece in self.pieces.pieces:
-                if piece.outward == stage:
+            for piece in self.pieces:
+                if self._work[piece.index].assigned.outward == stage:
                     text.append(render(self._work[piece.index].outward, self.dtype, f"p{piece.index}_"))
                     text += [self._branch(piece, each) for each in self._work[piece.index].checks if each.text]
                     (later if self.passes else text).append(self._branch(piece, self._work[piece.index].news))
         for work in self._work.values():
             later += [self._branch(work.piece, listing) for listing in work.rounds]
         if self.passes:
-            kept = {f"p{piece.index}_": [piece] for piece in self.pieces.pieces}
+            kept = {f"p{piece.index}_": [piece] for piece in self.pieces}
             order = reversed(self._work.values()) if self.passes.counted else self._work.values()  # children first
             ahead = [self._branch(work.piece, work.ahead) for work in order if work.ahead.text]
             if self.pairs:
@@ -185,13 +189,12 @@ class Team:
         for alike in kinds.values():
             text.append(f"{'else ' if text else ''}if ({any_of(_warps(alike))}) {{")
             inward, outward = self._shared_sweeps(alike)
-            warps = [work.piece.warp for work in alike]
+            warps = [work.assigned.warp for work in alike]
             between = self._inner(warps)
             if self.pairs:
-                inward = "\n".join([push_pairs("LOAD", "warp", self.pieces.warps), inward])
-                between = "\n".join([
-                    BARRIER, couple_pairs("warp", self.pieces.warps), between, release_pairs("warp", self.pieces.warps)
-                ])  # fmt: skip
+                inward = "\n".join([push_pairs("LOAD", "warp", self.schedule.warps), inward])
+                couple, release = (call("warp", self.schedule.warps) for call in (couple_pairs, release_pairs))
+                between = "\n".join([BARRIER, couple, between, release])
             text += [inward, between, outward]
             if not self.passes and any(work.rounds for works in kinds.values() for work in works):
                 text += [self._take_turns(alike, [[work.news] for work in alike], "n_"), BARRIER, self._rounds(alike)]
@@ -203,9 +206,11 @@ class Team:
         assert self.passes is not None
         leaves = [work for work in self._work.values() if not work.piece.children]
         inner = [work for work in self._work.values() if work.piece.children]
-        ranks: list[dict[int, Work]] = [{leaf.piece.warp: leaf for leaf in leaves}]  # by warp, one of its pieces each
+        ranks: list[dict[int, Work]] = [
+            {leaf.assigned.warp: leaf for leaf in leaves}
+        ]  # by warp, one of its pieces each
         for work in inner:
-            warp = work.piece.warp
+            warp = work.assigned.warp
             free = next((rank for rank in ranks if warp not in rank), None)
             if free is None:
                 ranks.append(free := {})
@@ -216,8 +221,8 @@ class Team:
         ranks_by_name = dict(zip(names, ranks, strict=True))
         text += self._ahead(leaves, ranks_by_name)
         if self.pairs:
-            text += [BARRIER, begin_pairs("warp", self.pieces.warps)]
-            a_pass = "\n".join([a_pass, BARRIER, judge_pairs("warp", self.pieces.warps)])
+            text += [BARRIER, begin_pairs("warp", self.schedule.warps)]
+            a_pass = "\n".join([a_pass, BARRIER, judge_pairs("warp", self.schedule.warps)])
         if self._in_turns:
             a_pass = "\n".join(
                 [
@@ -231,11 +236,11 @@ class Team:
         elif self.passes.flags is None:
             text.append(pass_loops.run_one_pass(a_pass, BARRIER, self.c))
         else:
-            text.append(pass_loops.repeat_team_passes(a_pass, self.passes.flags, self.pieces.warps, self.c))
+            text.append(pass_loops.repeat_team_passes(a_pass, self.passes.flags, self.schedule.warps, self.c))
         for last in (False, True):
             text_of_ranks = []
             for at, (name, rank) in enumerate(zip(names, ranks, strict=True)):
-                works = [rank.get(leaf.piece.warp) for leaf in leaves]
+                works = [rank.get(leaf.assigned.warp) for leaf in leaves]
                 turns = [[] if work is None else work.rounds if last else [work.news] for work in works]
                 text_of_ranks.append(self._take_turns(leaves, turns, f"c{at}_", name))
             if last and any(text_of_ranks):
@@ -252,7 +257,7 @@ class Team:
         """Return the turns of pieces, the "laws" or the "checks", in loops; ``ranks`` as for :meth:`_ahead`."""
         text = []
         for at, (prefix, rank) in enumerate(ranks.items()):
-            works = [rank.get(leaf.piece.warp) for leaf in leaves]
+            works = [rank.get(leaf.assigned.warp) for leaf in leaves]
             turns = [[] if work is None else [*getattr(work, name)] for work in works]
             text.append(self._take_turns(leaves, turns, f"{name}{at}_", prefix, loops=True))
         return "\n".join(text)
@@ -266,14 +271,14 @@ class Team:
         text: list[str] = []
         if not self.passes.counted:
             for at, (name, rank) in enumerate(ranks.items()):
-                works = [rank.get(leaf.piece.warp) for leaf in leaves]
+                works = [rank.get(leaf.assigned.warp) for leaf in leaves]
                 text.append(self._take_turns(leaves, [[] if x is None else [x.ahead] for x in works], f"h{at}_", name))
             return text
-        for stage in range(1 + max(work.piece.inward for work in self._work.values())):
+        for stage in range(1 + max(work.assigned.inward for work in self._work.values())):
             text += [BARRIER] if stage else []
             for at, (name, rank) in reversed(list(enumerate(ranks.items()))):  # children before their parents
-                works = [rank.get(leaf.piece.warp) for leaf in leaves]
-                turns = [[x.ahead] if x is not None and x.piece.inward == stage else [] for x in works]
+                works = [rank.get(leaf.assigned.warp) for leaf in leaves]
+                turns = [[x.ahead] if x is not None and x.assigned.inward == stage else [] for x in works]
                 text.append(self._take_turns(leaves, turns, f"h{stage}_{at}_", name))
         return text
 
@@ -281,19 +286,19 @@ class Team:
         """Return the stages between the inward and outward sweeps of the leaves, for the inner pieces of ``warps``."""
         owners: dict[tuple, list[list[Work]]] = {}
         for warp in warps:
-            mine = [work for work in self._work.values() if work.piece.children and work.piece.warp == warp]
+            mine = [work for work in self._work.values() if work.piece.children and work.assigned.warp == warp]
             if mine:
-                owners.setdefault(tuple((w.text, w.piece.inward, w.piece.outward) for w in mine), []).append(mine)
+                owners.setdefault(tuple((w.text, w.assigned.inward, w.assigned.outward) for w in mine), []).append(mine)
         text: list[str] = []
         for chains in owners.values():
-            text.append(f"{'else ' if text else ''}if ({any_of([chain[0].piece.warp for chain in chains])}) {{")
+            text.append(f"{'else ' if text else ''}if ({any_of([chain[0].assigned.warp for chain in chains])}) {{")
             shared = [self._shared_sweeps(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
             for stage in range(1, self._last + 1):
                 text.append(BARRIER)
                 order = list(zip(chains[0], shared, strict=True))
-                text += [inward for work, (inward, _) in reversed(order) if work.piece.inward == stage]
+                text += [inward for work, (inward, _) in reversed(order) if work.assigned.inward == stage]
                 for at, (alike, (_, outward)) in enumerate(zip(zip(*chains, strict=True), shared, strict=True)):
-                    if alike[0].piece.outward == stage:
+                    if alike[0].assigned.outward == stage:
                         text.append(outward)
                         if not self.passes:
                             text.append(
@@ -377,4 +382,4 @@ def _any_world(call: str, warps: int) -> str:
 
 def _warps(works: Sequence[Work]) -> list[int]:
     """Return the warp of each piece."""
-    return [work.piece.warp for work in works]
+    return [work.assigned.warp for work in works]

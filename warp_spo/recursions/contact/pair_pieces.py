@@ -89,15 +89,16 @@ def by_limbs(scene: Scene) -> bool:
     """Whether limbs side by side can take a step of a scene with pairs."""
     links = Links(scene)
     pieces = Pieces(links)
-    return pieces.warps > 1 and seats_of(links, pieces) is not None
+    return len(pieces.leaves) > 1 and seats_of(links, pieces) is not None
 
 
-def team(links: Links, pieces: Pieces, alpha: int, first: int) -> Team:
-    """Return the pairs of a scene for their native code; ``alpha``, ``first``: as there."""
+def team(links: Links, pieces: Pieces, alpha: int, first: int, warps_of: list[int]) -> Team:
+    """Return the pairs of a scene for their native code; ``alpha``, ``first``: as there; ``warps_of``: each piece's."""
     seats, scene = seats_of(links, pieces), links.scene
     assert seats is not None
     points, eps = zip(*((pair.points, pair.eps) for pair in scene.contact_pairs), strict=True)
-    limbs, warps = (tuple(getattr(piece, name) for piece in seats.limbs) for name in ("index", "warp"))
+    limbs = tuple(piece.index for piece in seats.limbs)
+    warps = tuple(warps_of[limb] for limb in limbs)
     dofs = tuple(piece.weight for piece in seats.limbs)
     seated = tuple(piece.parent is not None for piece in seats.limbs)
     weights, solids = tuple(inverse_weights(scene)), solids_of(links)[0]
