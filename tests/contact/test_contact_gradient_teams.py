@@ -129,15 +129,15 @@ BUGS = {
     "what a limb hands on": (
         PassGradient,
         "stores",
-        'trace.receive("G", piece)[: len(self.passed_on)]',
+        'trace.exchange.receive("G", piece)[: len(self.passed_on)]',
         "[0.0] * len(self.passed_on)",
     ),
     "what points on the trunk hand on": (PassGradient, "_carry", "if link is not self._under:", "if True:"),
     "how inertias count": (
         PassSolve,
         "_tell",
-        'trace.send("Q", piece, ways)',
-        'trace.send("Q", piece, [0.0] * len(ways))',
+        'exchange.send("Q", piece, ways)',
+        'exchange.send("Q", piece, [0.0] * len(ways))',
     ),
     "how inertias count in memory": (
         PassGradient,

@@ -12,11 +12,11 @@ from support.granularity_scenes import MANY, hand
 from support.routines import ROUTINES
 from support.step_scenes import FORCES, TOLERANCE, H, furnished, states
 from warp_spo.execution import plan
+from warp_spo.execution.segment import programs as segment_programs
 from warp_spo.execution.segment import warp_specialized as teams
 from warp_spo.kernels import pass_loops
 from warp_spo.kernels import straight_line as straight
 from warp_spo.kernels.substeps import repeat_on_cuda
-from warp_spo.recursions.step import step as steps
 from warp_spo.recursions.step.step import SHORT, Step, by_pieces
 
 WORLDS = 4
@@ -101,7 +101,7 @@ def test_equals_the_step_by_trees(integrator, device):
 @pytest.mark.parametrize(("name", "dtype"), [("hand", "float64"), ("fork", "float64"), ("driven", "float32")])
 def test_laws_in_turns_or_in_statements(name, dtype, most, device, monkeypatch):
     """Both are the dense step, of all worlds."""
-    monkeypatch.setattr(steps, "MOST_LAWS", most)
+    monkeypatch.setattr(segment_programs, "MOST_LAWS", most)
     scene = scene_of(name)
     dyn = spo.Dynamics(scene, WORLDS, device=device, dtype=dtype, granularity="segment")
     a = states(scene, WORLDS, dtype)
@@ -188,7 +188,7 @@ def test_the_step_writes_the_states_of_bodies(name, monkeypatch):
 @pytest.mark.parametrize("name", SCENES)
 def test_warps_take_turns(name, most, monkeypatch):
     """Laws and checks in loops, and in statements."""
-    monkeypatch.setattr(steps, "MOST_LAWS", most)
+    monkeypatch.setattr(segment_programs, "MOST_LAWS", most)
     text, a, (q, qd, _) = texts_of(monkeypatch, name, status=True)
     assert ("force_row" in text.cuda) == (most == 0)
     for backwards in (False, True):

@@ -38,7 +38,7 @@ def factor(trace: Trace) -> tuple[Factors, list[Store]]:
             trace.place(link)
             continue
         eliminate(trace, link, done, inner)
-        stores += trace.send_to_parent("P", link, inner[id(link)].packed)
+        stores += trace.exchange.send_to_parent("P", link, inner[id(link)].packed)
     return done, stores
 
 
@@ -47,7 +47,7 @@ def eliminate(
 ) -> None:
     """Add the factor of a link to ``done``, and P+ in its parent's frame to ``inner``, after its children's."""
     trace.label(link, "P")
-    carried = trace.from_children(link, "P", inner, Articulated.unpacked)
+    carried = trace.exchange.from_children(link, "P", inner, Articulated.unpacked)
     if id(link) in trace.dampers:
         carried = [*carried, trace.dampers[id(link)]]
     if link.group is not None:
@@ -111,7 +111,7 @@ def reduce(
         trace.ahead += [*(place.pose.turn or ()), *bias, *z]  # the passes of a step share them
         if key in trace.pushes:
             z = z - trace.pushes[key]
-        for force in trace.from_children(link, letters[-1], forces, Vector):
+        for force in trace.exchange.from_children(link, letters[-1], forces, Vector):
             z = z + force
         if link.group is None:
             right = [tau(dof) for dof in link.dofs]
@@ -121,9 +121,9 @@ def reduce(
             if link.closes:
                 leader, right = id(link.group.links[0]), [tau(dof) for dof in link.dofs]
                 rates[leader], _, forces[key] = groups.reduce(done[leader], trace.places, trace.motions, waiting, right)
-        carried, force = trace.add_contacts(link, inner[key], forces[key])
-        stores += trace.send_to_parent("P", link, carried.packed) if "P" in letters else []
-        stores += trace.send_to_parent(letters[-1], link, force)
+        carried, force = trace.exchange.add_contacts(link, inner[key], forces[key], trace.dampers, trace.pushes)
+        stores += trace.exchange.send_to_parent("P", link, carried.packed) if "P" in letters else []
+        stores += trace.exchange.send_to_parent(letters[-1], link, force)
     return done, rates, stores
 
 
@@ -148,10 +148,11 @@ def expand(
         key = id(link)
         if link.parent is None:
             above = base
-        elif id(link.parent) in trace.own:
+        elif trace.exchange.own(link.parent):
             above = alpha[id(link.parent)]
         else:
-            received = trace.receive(letter, trace.piece.parent)  # type: ignore[union-attr, arg-type]
+            assert trace.exchange.parent is not None
+            received = trace.exchange.receive(letter, trace.exchange.parent)
             above = alpha[id(link.parent)] = Vector(received[:3]), Vector(received[3:])
         place, move = trace.places[key], trace.motions[key]
         if link.group is None:
@@ -163,8 +164,7 @@ def expand(
             if not link.leads:
                 continue
         stores += [Store(name, (dof,), value) for dof, value in zip(link.dofs, qdd, strict=True)]
-        if trace.piece is not None and trace.piece.children and link is trace.piece.links[-1]:
-            stores += trace.send(letter, trace.piece, (*alpha[key][0], *alpha[key][1]))
+        stores += trace.exchange.send_to_children(letter, link, (*alpha[key][0], *alpha[key][1]))
     return stores
 
 

@@ -15,7 +15,7 @@ from ..trace.spatial import Vector, dot, total
 from . import articulated
 from .articulated_sweeps import NO_FORCE, factor, factor_tree, mirror, pack, pivots, propagate_inward, weighted_products
 from .model.links import Link
-from .model.segments import Piece, Pieces
+from .model.segments import Piece
 from .motion import STILL
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class Inverse:
     """
 
     def __init__(self, trace: Trace):
-        self.trace, self.pieces = trace, Pieces(trace.links).pieces
+        self.trace, self.pieces = trace, trace.exchange.segments
         self.entries: dict[tuple[int, int], Value] = {}
         self.rounds: list[dict[tuple[int, int], Value]] = []
         self.done, self.stores = factor(trace)
@@ -42,7 +42,7 @@ class Inverse:
         self._rates: dict[int, list[Value]] = {}  # the part of Y_j in j's own piece
         self._forces: dict[int, Vector] = {}  # F_j
         self._columns: dict[int, list[Value]] = {}  # Y_j
-        own = [piece for piece in self.pieces if trace.piece is None or piece.index == trace.piece.index]
+        own = trace.exchange.own_segments
         for piece in own:
             for at, link in enumerate(piece.links):
                 for i, dof in enumerate(link.dofs):
@@ -71,15 +71,15 @@ class Inverse:
         """Complete the columns of a piece and multiply them with each other."""
         trace = self.trace
         further = [one for one in reversed(piece.ancestors)]
-        N = [] if piece.parent is None else _sixes(trace.receive("N", piece.parent))
-        D = [d for one in further for d in trace.receive("D", one)]
+        N = [] if piece.parent is None else _sixes(trace.exchange.receive("N", piece.parent))
+        D = [d for one in further for d in trace.exchange.receive("D", one)]
         D += [pivot.D for link in piece.links for pivot in self.done[id(link)].pivots]
         for j in piece.dofs:
             trace.graph.step = f"column {j}|y"
             self._columns[j] = [dot(row, self._forces[j]) for row in N] + self._rates[j]
         if any(other.looks_at(piece) for other in self.pieces):
             heads = (self._columns[j][: len(N)] for j in piece.dofs)
-            self.news += trace.send("Y", piece, [x for head in heads for x in head])
+            self.news += trace.exchange.send("Y", piece, [x for head in heads for x in head])
         weighted = {j: [d * y for d, y in zip(D, self._columns[j], strict=False)] for j in piece.dofs}
         for at, j in enumerate(piece.dofs):
             trace.graph.step = f"column {j}|m"
@@ -93,18 +93,18 @@ class Inverse:
         for c in range(6):
             rates, force = self._inward(piece.links, Vector(float(i == c) for i in range(6)), still)
             columns.append([dot(row, force) for row in N] + rates)
-        self.stores += trace.send("N", piece, [x for row in zip(*columns, strict=True) for x in row])
-        self.stores += trace.send("D", piece, D[len(N) :])
+        self.stores += trace.exchange.send("N", piece, [x for row in zip(*columns, strict=True) for x in row])
+        self.stores += trace.exchange.send("D", piece, D[len(N) :])
         rest = {j: [0.0] * (len(D) - len(self._columns[j])) for j in piece.dofs}
-        self.stores += trace.send("V", piece, [x for j in piece.dofs for x in self._columns[j] + rest[j]])
+        self.stores += trace.exchange.send("V", piece, [x for j in piece.dofs for x in self._columns[j] + rest[j]])
 
     def _meet(self, piece: Piece, other: Piece) -> None:
         """Compute the entries of two branches, or of a branch and one that carries it, over shared pivots."""
         fork = piece.fork(other)
         assert fork is not None
         common = len(fork.all_dofs)
-        D = [d for one in reversed([fork, *fork.ancestors]) for d in self.trace.receive("D", one)]
-        sent = self.trace.receive("V" if fork is other else "Y", other)
+        D = [d for one in reversed([fork, *fork.ancestors]) for d in self.trace.exchange.receive("D", one)]
+        sent = self.trace.exchange.receive("V" if fork is other else "Y", other)
         length = len(sent) // other.weight
         for at, i in enumerate(other.dofs):
             self.trace.graph.step = f"column {i}|m"
@@ -127,7 +127,7 @@ def mass_matrix_inverse(trace: Trace) -> list[Store]:
         return by_columns(trace)
     inverse = Inverse(trace)
     rounds = [mirror(entries) for entries in inverse.rounds]
-    if trace.piece is not None:
+    if not trace.exchange.alone:
         trace.rounds, trace.news, rounds = rounds, inverse.news, []
     return inverse.stores + mirror(inverse.entries) + [item for stores in rounds for item in stores]
 

@@ -20,6 +20,7 @@ from ...recursions.contact.points import own_points
 from ...recursions.contact.secant_laws import SECANT
 from ...recursions.model import messages
 from ...recursions.model import shared_constants as alike
+from ...recursions.model.exchange import SegmentExchange
 from ...recursions.model.messages import INWARD, OUTWARD
 from ...recursions.model.segments import Piece, Pieces
 from ...recursions.model.tracing import Trace
@@ -35,6 +36,7 @@ from .schedule import PARTS, Schedule
 from .warp_specialized import HELD, Passes, Team, Work
 
 MOST_REGISTERS = 255  # of a thread
+MOST_LAWS = 12  # dofs of unlike pieces; with more, laws are found in loops, because their statements are fetched slowly
 BODIES = "bodies"  # option of a step by limbs whose kernel writes the states of bodies, too
 
 
@@ -131,12 +133,12 @@ class _Limbs:
         """Return what the work on a piece stores; the constants ``unfolded`` do not fold, see :mod:`.alike`."""
         shapes, options = self.job.shapes, self.job.options
         links = self.builder.own_links(options, self.unfolds)  # its own: pieces of equal structure then give equal text
-        slot = lambda letter, piece: self.slots[letter, piece.index]  # noqa: E731
-        trace = Trace(links, self.dtype, tuple(shapes), Pieces(links).pieces[index], slot)
+        exchange = SegmentExchange(links, index, self.slots, self.pieces.unlike > MOST_LAWS)
+        trace = Trace(links, self.dtype, tuple(shapes), exchange)
         trace.team = self.couples
-        if self.unfolds and trace.piece is not None:
+        if self.unfolds:
             points = [number for number, _ in own_points(trace)]
-            links.numbers = alike.Numbers(links.graph, trace.piece, points, unfolded)
+            links.numbers = alike.Numbers(links.graph, exchange.segment, points, unfolded)
 
         def flat(items: list[Store]) -> list[Store]:
             return [flatten(item, shapes) for item in items]

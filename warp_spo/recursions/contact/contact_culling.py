@@ -97,7 +97,7 @@ def gather(
         if point.link is not None:
             on.setdefault(id(point.link), []).append(at)
     found: dict[int, Crowd] = {}
-    op = "branch" if trace.piece is None else "fork"
+    op = "branch" if trace.exchange.alone else "fork"
     for key, places in on.items():
         some = [points[at] for at in places]
         if len(some) >= CROWD and all(point.near is None for point in some):

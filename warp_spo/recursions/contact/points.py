@@ -32,7 +32,7 @@ from ..kinematics import arm_on_link, carried_velocity, frame_on_link, zero
 from ..model import effective_mass as neutral
 from ..model.links import Link, Links
 from ..model.scene_cache import remembered
-from ..model.segments import Piece, Pieces
+from ..model.segments import Piece
 from ..model.tracing import Trace
 from ..motion import Motion, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
@@ -238,7 +238,8 @@ def point_links(links: Links) -> list[Link | None]:
 
 def own_points(trace: Trace) -> list[tuple[int, ContactPoint]]:
     """Return the contact points that a trace works on, with their numbers."""
-    return points_of(trace.links, trace.piece)
+    exchange = trace.exchange
+    return _all_points(trace.links) if exchange.alone else points_of(trace.links, exchange.own_segments[0])
 
 
 def keeps_arms(trace: Trace) -> bool:
@@ -246,18 +247,19 @@ def keeps_arms(trace: Trace) -> bool:
 
     Where limbs share the work they do, unless a limb has so many spheres that registers run out.
     """
-    pieces = [] if trace.piece is None else Pieces(trace.links).pieces
+    pieces = trace.exchange.segments if trace.exchange.shares_code else []
     spheres = (sum(point.radius > 0.0 for _, point in points_of(trace.links, piece)) for piece in pieces)
     return max(spheres, default=0) <= ARMS
 
 
-def points_of(links: Links, piece: Piece | None) -> list[tuple[int, ContactPoint]]:
-    """Return the contact points that a piece works on, or the whole tree, with their numbers."""
-    points = list(enumerate(links.scene.contact_points))
-    if piece is None:
-        return points
+def _all_points(links: Links) -> list[tuple[int, ContactPoint]]:
+    return list(enumerate(links.scene.contact_points))
+
+
+def points_of(links: Links, piece: Piece) -> list[tuple[int, ContactPoint]]:
+    """Return the contact points that a piece works on, with their numbers."""
     on: dict[int | None, list[tuple[int, ContactPoint]]] = {}
-    for number, point in points:
+    for number, point in _all_points(links):
         link = links.seats[point.body].link
         on.setdefault(None if link is None else id(link), []).append((number, point))
     found = on.get(None, []) if piece.index == 0 else []

@@ -22,7 +22,6 @@ from ..articulated_sweeps import Factors, expand, reduce
 from ..coordinates import integrate_link
 from ..kinematics import zero
 from ..model.links import Link
-from ..model.segments import Piece, Pieces
 from ..newton_euler import inverse_dynamics
 from ..step.joint_laws import Law, add_laws
 from ..step.step import GAIN, Step
@@ -77,7 +76,7 @@ class ContactStep(Step):
         trace, kept = self.trace, self.kept
         bias, sent_ahead = self._bias()
         points, touches, candidates = [], [], []
-        alone = trace.piece is None  # limbs side by side are for GPUs, where branches cost more than they spare
+        alone = trace.exchange.alone  # limbs side by side are for GPUs, where branches cost more than they spare
         for raw in place_points(trace, self.impedance, self.qd, "contact_f" in self.reports, branches=alone):
             point, first = raw.settled(*self._first(raw))
             points.append(point)
@@ -98,7 +97,7 @@ class ContactStep(Step):
         gains = {item.index[0]: self.h * item.value for item in moved if item.array == "out"}
         gains = self.couple(done, gains, alpha)
         passed = [item for item in moved if item.array != "out"]
-        passed += [Store(GAIN, (self._kept.get(dof, dof),), gain) for dof, gain in gains.items()]
+        passed += [Store(GAIN, (trace.exchange.place_of(dof),), gain) for dof, gain in gains.items()]
         efforts = []
         for link in self.links:
             trace.label(link, "u")
@@ -117,7 +116,7 @@ class ContactStep(Step):
             self.excess = [self._last(largest(values)) for values in (*excess[:2], efforts, excess[2])]
         trace.begin = sent_ahead + kept.begin
         after = self._after(qdd, status)
-        if trace.piece is None:
+        if trace.exchange.alone:
             return passed + kept.end + after
         trace.news = after
         return sent + passed + kept.end
@@ -318,8 +317,8 @@ class ContactStep(Step):
         results = [item.value for item in stores]
         for name in self.reports:
             stores += self.finished[name]
-        if trace.piece is not None:
-            return stores + self._sent_to_the_first(trace.piece, results, status)
+        if not trace.exchange.alone:
+            return stores + self._sent_to_the_first(results, status)
         if self.excess and any(more := self.last_excess()):
             self.excess = [largest([own, *others]) for own, others in zip(self.excess, more, strict=True)]
         stores += self._excess_stores()
@@ -328,18 +327,17 @@ class ContactStep(Step):
             stores.append(Store("status", (), self._verdict(self._word(results, False))))
         return stores
 
-    def _sent_to_the_first(self, own: Piece, results: list[Value], status: bool) -> list[Store]:
+    def _sent_to_the_first(self, results: list[Value], status: bool) -> list[Store]:
         """Return the stores that send a piece's excess and status to the first piece, which stores the world's."""
-        trace, sent = self.trace, []
+        trace, exchange, sent = self.trace, self.trace.exchange, []
         if self.excess:
-            sent += trace.send("E", own, self.excess)
-            if own.index == 0:
-                pieces = Pieces(trace.links).pieces
-                sent_by = zip(*(trace.receive("E", piece) for piece in pieces), strict=True)
+            sent += exchange.send("E", exchange.own_segments[0], self.excess)
+            if exchange.is_first:
+                sent_by = zip(*(exchange.receive("E", piece) for piece in exchange.segments), strict=True)
                 kinds = ((*values, *more) for values, more in zip(sent_by, self.last_excess(), strict=True))
                 self.excess = [largest(list(values)) for values in kinds]
-        sent += self._words(own, results) if status else []
-        first = [*self._excess_stores(), *self.reported()] if own.index == 0 else []
+        sent += self._words(results) if status else []
+        first = [*self._excess_stores(), *self.reported()] if exchange.is_first else []
         if first:
             trace.rounds = [[*first, *(item for turn in trace.rounds for item in turn)]]
         return sent

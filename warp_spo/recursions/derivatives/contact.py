@@ -42,7 +42,7 @@ from ..contact.velocity_kicks import KICK, PATH, START
 from ..coordinates import integrate_link
 from ..kinematics import carried_velocity
 from ..model.links import Link
-from ..model.segments import Piece, Pieces
+from ..model.segments import Piece
 from ..motion import hinge_motion, whirl
 from .adjoints import entries, result_name
 from .contact_pass import NUMBER, OnePass
@@ -112,17 +112,16 @@ class PassAdjoint(OnePass):
     @property
     def _carrier(self) -> Piece | None:
         """The piece that this one moves on, if that is one of those weighed."""
-        piece = self.trace.piece
-        above = None if piece is None else piece.parent
+        above = self.trace.exchange.parent
         return above if above is not None and above.index in self.weighed else None
 
     @property
     def _inertia_message(self) -> list[Value]:
         """Message of the piece's articulated inertia, with the dampers of its points on the link that it moves on."""
-        piece = self.trace.piece
-        if self._carrier is None or piece is None:
+        if self._carrier is None:
             return []
-        P, link = self.inner[id(piece.links[0])], piece.links[0]
+        link = self.trace.own_links[0]
+        P = self.inner[id(link)]
         return (P + self.trace.dampers[id(link.parent)] if id(link.parent) in self.trace.dampers else P).packed
 
     def _find_points(self) -> list[Point]:
@@ -204,7 +203,7 @@ class PassSolve(PassAdjoint):
         sent += [item for item in found if item.array != "out"]
         pushed = {key: (_cut(pushed[key][0]), _cut(pushed[key][1])) for key in on}
         if self._carrier is not None:
-            results, seeds = results + self._inertia_message, seeds + trace.receive("Q", self._carrier)
+            results, seeds = results + self._inertia_message, seeds + trace.exchange.receive("Q", self._carrier)
         sent += self._tell(results, seeds)
         power = self._power(solved, pushed)
         came = self.before | {self._dofs + at: value for at, value in self.kept.variables.items()}
@@ -219,15 +218,15 @@ class PassSolve(PassAdjoint):
 
     def _tell(self, results: list[Value], seeds: list[Value]) -> list[Store]:
         """Return the stores of the gradient by what pieces carry, and those that tell it to the pieces carried."""
-        trace, found = self.trace, []
-        for at, index in enumerate(self.weighed):
-            piece = trace.piece or Pieces(trace.links).pieces[index]
-            if piece.index != index:
+        exchange, found = self.trace.exchange, []
+        for piece in exchange.own_segments:
+            if piece.index not in self.weighed:
                 continue
-            carried = trace.from_children(piece.links[-1], "P", self.inner, Articulated.unpacked)[0].packed
+            at = self.weighed.index(piece.index)
+            carried = exchange.from_children(piece.links[-1], "P", self.inner, Articulated.unpacked)[0].packed
             ways = _by_each(carried, reverse(results, _distinct(carried), seeds, True))
             found += [Store(f"{INERTIA}_out", (len(ways) * at + i,), way) for i, way in enumerate(ways)]
-            found += trace.send("Q", piece, ways)
+            found += exchange.send("Q", piece, ways)
         return found
 
 
@@ -241,9 +240,9 @@ class PassGradient(PassAdjoint):
     """
 
     def __init__(self, trace: Trace, laws: tuple[int, ...]):
-        piece = trace.piece
-        self._under = None if piece is None or piece.parent is None else piece.parent.links[-1]
-        self._end = piece.links[-1] if piece is not None and piece.children else None
+        parent = trace.exchange.parent
+        self._under = None if parent is None else parent.links[-1]
+        self._end = trace.own_links[-1] if trace.exchange.children else None
         self._reached = with_ancestors(point_links(trace.links))
         self.given: list[Value] = []
         self.passed_on: list[Value] = []
@@ -302,16 +301,16 @@ class PassGradient(PassAdjoint):
                 results + packed,
                 seeds + [trace.graph.input(INERTIA, first + i) for i in range(len(packed))],
             )
-        for piece in trace.piece.children if trace.piece is not None else ():
+        for piece in trace.exchange.children:
             results += self.passed_on
-            seeds += trace.receive("G", piece)[: len(self.passed_on)]
+            seeds += trace.exchange.receive("G", piece)[: len(self.passed_on)]
         held = [*self.qdd.values(), *self.solved.values(), *self.before.values(), *kept.variables.values()]
         stops = _distinct([*self.given, *held])
         leaves = [x for x in ordered(results, stops) if x.op == "input"]
         heights = [x for x, *_ in self.corners.values()] if HEIGHTS in wrt else []
         back = reverse(results, [*stops, *leaves, *heights], seeds, True)
-        sent = trace.send_to_parent("G", trace.own_links[0], _by_each(self.given, back))
-        sent += trace.send_to_parent("P", trace.own_links[0], packed) if packed else []
+        sent = trace.exchange.send_to_parent("G", trace.own_links[0], _by_each(self.given, back))
+        sent += trace.exchange.send_to_parent("P", trace.own_links[0], packed) if packed else []
         rest = iter(back[len(stops) :])
         ways: Ways = dict(zip((x.args for x in leaves), rest, strict=False))
         for (_, *at), way in zip(self.corners.values(), rest, strict=False):
@@ -327,21 +326,22 @@ class PassGradient(PassAdjoint):
             if name == HEIGHTS:
                 cells = zip(self.surfaces, (point.cell for point in self.points), strict=True)
                 found += [Store(f"{HEIGHTS_AT}_bar", (at,), cell.first) for at, cell in cells if cell is not None]
-            if name == ORIGIN and trace.piece is not None:
-                sent += self._add_origins(trace.piece, ways)
-                if trace.piece.parent is not None:
+            if name == ORIGIN:
+                sent += self._add_origins(ways)
+                if trace.exchange.parent is not None:
                     continue
             for index, value in self._entries(name, ways):
                 found.append(Store(result_name(name, wrt), index, self._of_later(f"{name}_later", *index) + value))
         return [*sent, *power.stores, *found]
 
-    def _add_origins(self, own: Piece, ways: Ways) -> list[Store]:
+    def _add_origins(self, ways: Ways) -> list[Store]:
         """Add to the gradient by the ground's origin those of the pieces further out; return what sends it inward."""
-        for piece in own.children:
-            for i, more in enumerate(self.trace.receive("O", piece)):
+        exchange = self.trace.exchange
+        for piece in exchange.children:
+            for i, more in enumerate(exchange.receive("O", piece)):
                 ways[ORIGIN, i] = ways.get((ORIGIN, i), 0.0) + more
         sums = [ways.get((ORIGIN, i), 0.0) for i in range(3)]
-        return self.trace.send_to_parent("O", own.links[0], sums)
+        return exchange.send_to_parent("O", self.trace.own_links[0], sums)
 
     def _entries(self, name: str, ways: Ways) -> Iterable[tuple[tuple[int, ...], Value]]:
         """Return (index, gradient) of every entry of an argument or value that this trace works on.
@@ -350,9 +350,9 @@ class PassGradient(PassAdjoint):
         """
         if name == HEIGHTS:
             places: Iterable[tuple[int, ...]] = itertools.product(self.surfaces, range(CORNERS))
-        elif self.trace.piece is not None and name in CONTACT_VALUES:
+        elif not self.trace.exchange.alone and name in CONTACT_VALUES:
             places = [(number,) for number, _ in own_points(self.trace)]
-        elif self.trace.piece is not None and name == "ctrl":
+        elif not self.trace.exchange.alone and name == "ctrl":
             places = [(number,) for number in self._controls(list(self.before))]
         else:
             return entries(self.trace, name, ways)

@@ -19,7 +19,6 @@ from ..contact.points import Point, own_points, surface_numbers
 from ..contact.secant_laws import Kept, single_dofs
 from ..contact.step import ContactStep, Touch
 from ..model.links import Link, Links
-from ..model.segments import Pieces
 from ..step.joint_laws import LIMIT, Law
 from ..step.step import GAIN
 
@@ -90,7 +89,7 @@ class OnePass(ContactStep):
         """Numbers of the pieces that carry others whose inertia counts in what laws leave for the next pass."""
         if not self.kicked:
             return ()
-        pieces = Pieces(self.trace.links).pieces
+        pieces = self.trace.exchange.segments
         own = {piece.index for piece in pieces if any(self._weighs(link) for link in piece.links if link.leads)}
         chains = {piece.index: {piece.index, *(further.index for further in piece.ancestors)} for piece in pieces}
         return tuple(piece.index for piece in pieces if piece.children and own & chains[piece.index])
@@ -127,7 +126,7 @@ class OnePass(ContactStep):
     def forward(self) -> list[Store]:
         """Return the stores of what the pass leaves, and messages to other pieces."""
         trace = self.trace
-        dofs = {self._kept.get(dof, dof): dof for dof in self.before}
+        dofs = {trace.exchange.place_of(dof): dof for dof in self.before}
         stores = self.stores(qdd=False, status=False)
         sent = [item for item in trace.begin if item.array != ROW]
         trace.begin, trace.ahead, trace.news, trace.rounds = [], [], [], []  # there is no loop

@@ -1,4 +1,4 @@
-"""The state of one symbolic evaluation of a scene: its inputs, where links are placed, and messages between pieces.
+"""The state of one symbolic evaluation of a scene: its inputs and where links are placed.
 
 The recursions are functions of a :class:`Trace` that return what they store. ``label`` names in the emitted code which
 link and which letter of the paper a value belongs to.
@@ -7,7 +7,7 @@ link and which letter of the paper a value belongs to.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from ...trace.emission import Store
@@ -15,7 +15,7 @@ from ...trace.scalars import Value
 from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Vector, cross
 from .. import motion, newton_euler
 from ..motion import STILL, Motion
-from . import messages
+from .exchange import Exchange, WholeTree
 from .links import Link, Links, Placed, place_link
 from .segments import Piece
 
@@ -30,9 +30,7 @@ class Trace:
         dtype: "float32" or "float64"; pivots are compared with its rounding.
         inputs: names of the arrays that are read: "qd", "tau", "qdd", "body_f", "b"; an array that is not among them is
             zero and costs nothing.
-        piece: trace the work on this piece alone. The motion of its ancestors is computed anew; what it receives from
-            other pieces and sends to them goes through the array "sent" or "returned", from ``slot(letter, piece)`` on.
-        slot: first entry of a message, by letter and piece.
+        exchange: what the evaluation works on, and its messages to others; None: it takes the whole tree.
 
     Attributes:
         places: by id of the link: its placement. motions: its velocity terms. axes: its axes in the inertial frame.
@@ -56,11 +54,10 @@ class Trace:
         links: Links,
         dtype: str,
         inputs: tuple[str, ...],
-        piece: Piece | None = None,
-        slot: Callable[[str, Piece], int] | None = None,
+        exchange: Exchange | None = None,
     ):
         self.links, self.graph, self.epsilon, self.inputs = links, links.graph, EPSILON[dtype], inputs
-        self.piece, self.slot = piece, slot
+        self.exchange = WholeTree(links) if exchange is None else exchange
         self.news: list[Store] = []
         self.rounds: list[list[Store]] = []
         self.ahead: list[Value] = []
@@ -73,13 +70,6 @@ class Trace:
         self.team: Any = None
         self.couples: list[tuple[int, list[Store]]] = []
         self.carried: list[Value] = []
-        self._mail: dict[tuple[str, int], list[Value]] = {}  # messages between pieces of this trace
-        self.own = set(map(id, links.links if piece is None else piece.links))
-        self.active = set(self.own)
-        above = None if piece is None else piece.links[0].parent
-        while above is not None:
-            self.active.add(id(above))
-            above = above.parent
         self.places: dict[int, Placed] = {}
         self.motions: dict[int, Motion] = {}
         self.axes: dict[int, Matrix] = {}
@@ -163,58 +153,26 @@ class Trace:
     def traversal(self) -> Iterator[tuple[Link, bool]]:
         """Yield (link, True) outward for this piece and its ancestors, (link, False) back for this piece's links."""
         for link, outward in self.links.traversal():
-            if id(link) in self.active and (outward or id(link) in self.own):
+            if self.exchange.needs_motion_of(link) and (outward or self.exchange.own(link)):
                 yield link, outward
 
     @property
     def own_links(self) -> list[Link]:
         """The links of this piece, parents first; all links where the whole tree is traced."""
-        return [link for link in self.links.links if id(link) in self.own]
+        return [link for link in self.links.links if self.exchange.own(link)]
 
     @property
     def active_links(self) -> list[Link]:
         """The links of this piece and those that it moves on, parents first."""
-        return [link for link in self.links.links if id(link) in self.active]
+        return [link for link in self.links.links if self.exchange.needs_motion_of(link)]
 
     @property
     def own_bodies(self) -> list[int]:
         """The bodies on the links of this piece; bodies that do not move count as the first piece's."""
-        carriers = {body: seat.link for body, seat in self.links.seats.items()}
-        rest = self.piece is None or self.piece.index == 0
-        return [body for body, link in carriers.items() if (rest if link is None else id(link) in self.own)]
+        carriers, exchange = {body: seat.link for body, seat in self.links.seats.items()}, self.exchange
+        return [body for body, link in carriers.items() if (exchange.is_first if link is None else exchange.own(link))]
 
-    def send(self, letter: str, piece: Piece, values: Iterable[Value]) -> list[Store]:
-        """Return the stores that send a message of ``piece``; a trace of the whole tree keeps the values instead."""
-        if self.piece is None:
-            self._mail[letter, piece.index] = list(values)
-            return []
-        assert self.slot is not None
-        first = self.slot(letter, piece)
-        return [Store(messages.way(letter), (first + i,), value) for i, value in enumerate(values)]
-
-    def receive(self, letter: str, piece: Piece) -> list[Value]:
-        """Return the message that ``piece`` sends."""
-        if self.piece is None:
-            return self._mail[letter, piece.index]
-        assert self.slot is not None
-        first = self.slot(letter, piece)
-        return [self.graph.input(messages.way(letter), first + i) for i in range(messages.size(letter, piece))]
-
-    def from_children(self, link: Link, letter: str, known: dict[int, Any], build: Callable[[list], Any]) -> list[Any]:
-        """Return the results of a link's children: those ``known`` here, or built from messages of other pieces."""
-        if self.piece is None or id(link.children[0] if link.children else link) in self.own:
-            return [known[id(child)] for child in link.children]
-        return [build(self.receive(letter, piece)) for piece in self.piece.children]
-
-    def add_contacts(self, link: Link, P: Articulated, z: Vector) -> tuple[Articulated, Vector]:
-        """Return P+ and z+ for a link's parent, with what contacts add to the parent if another piece works on it."""
-        key = id(link.parent)
-        if key in self.own or key not in self.dampers:
-            return P, z
-        return P + self.dampers[key], z - self.pushes[key]
-
-    def send_to_parent(self, letter: str, link: Link, values: Iterable[Value]) -> list[Store]:
-        """Return the stores that send a result of a link to its parent, if another piece works on the parent."""
-        if self.piece is None or link is not self.piece.links[0] or link.parent is None:
-            return []
-        return self.send(letter, self.piece, values)
+    @property
+    def piece(self) -> Piece | None:
+        """The piece of an evaluation of one, for the code that couples bodies; None: it takes the whole tree."""
+        return None if self.exchange.alone else self.exchange.own_segments[0]

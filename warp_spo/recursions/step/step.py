@@ -23,7 +23,7 @@ from ..articulated_sweeps import expand, reduce
 from ..coordinates import integrate_link
 from ..kinematics import body_states
 from ..model.links import Link
-from ..model.segments import Piece, Pieces
+from ..model.segments import Piece
 from ..model.tracing import Trace
 from .actuation import hinge_laws
 from .joint_laws import Law, add_laws, is_number
@@ -35,9 +35,6 @@ the number of the pass, from zero."""
 LOOPED = (GUESS, GAIN, MISSED)
 FORCE, RESISTANCE = "force", "resistance"
 """Of the laws of a piece's dofs at their guesses, where these are found in turns."""
-MOST_LAWS = (
-    12  # dofs of unlike pieces; beyond, laws take turns in loops, because their statements are fetched too slowly
-)
 SHORT = 10  # dofs; up to so many, passes solve a system that is formed once
 PATIENCE, TURNS = 8, 3  # passes after which a dof changes its guess in every third one only, one dof after the other
 FAINT = 1e-12  # resistance of a massless dof without active law, as a share of the resistances of its laws
@@ -61,9 +58,7 @@ class Step:
         self.laws: dict[int, list[Law]] = {}  # by dof
         self.forces: dict[int, Value] = {}
         self.messages: list[Store] = []  # to other pieces
-        self._kept = {dof: at for at, dof in enumerate(trace.piece.dofs)} if trace.piece else {}
-        self._in_turns = trace.piece is not None and Pieces(trace.links).unlike > MOST_LAWS
-        if self._in_turns:
+        if trace.exchange.laws_in_loops:
             reciprocal(self.h)  # older than what turns compute alone
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
@@ -90,8 +85,8 @@ class Step:
                 stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
         stores = self.put_back(stores)
         results = [item.value for item in stores]
-        if trace.piece is not None:
-            trace.news = stores + (self._words(trace.piece, results) if status else [])
+        if not trace.exchange.alone:
+            trace.news = stores + (self._words(results) if status else [])
             return self.messages + looped
         if status:
             trace.graph.step = "status|s"
@@ -110,7 +105,7 @@ class Step:
     @property
     def _is_short(self) -> bool:
         """Whether one thread makes several passes over few dofs."""
-        if self.trace.links.scene.dof_count > SHORT or self.trace.piece is not None:
+        if self.trace.links.scene.dof_count > SHORT or not self.trace.exchange.alone:
             return False
         return any(law.bends for link in self.links for laws in self.impedance.laws(link) for law in laws)
 
@@ -148,7 +143,7 @@ class Step:
             faint = FAINT * total(law.scale * law.resistance for law in self.laws[link.dofs[0]])
             held = pieces[0].resistance
             pieces = [pieces[0]._replace(resistance=select(less(0.0, held), held, faint))]
-        if self._in_turns:
+        if self.trace.exchange.laws_in_loops:
             pieces = [self._in_turn(dof, piece) for dof, piece in zip(link.dofs, pieces, strict=True)]
         self.forces |= {dof: piece.force for dof, piece in zip(link.dofs, pieces, strict=True)}
         return pieces
@@ -157,7 +152,7 @@ class Step:
         """Return the active piece of a dof as it is read in a pass: found in a turn before the pass, if laws bend."""
         if not any(law.bends for law in self.laws[dof]):
             return piece
-        at = (self._kept[dof],)
+        at = (self.trace.exchange.place_of(dof),)
         self.trace.laws.append(_turn([Store(FORCE, at, piece.force), Store(RESISTANCE, at, piece.resistance)]))
         return Law(self._kept_as(FORCE, dof), self._kept_as(RESISTANCE, dof))
 
@@ -181,11 +176,11 @@ class Step:
         A piece keeps its guess apart: it computes u anew in every pass, and until then its registers are free.
         """
         apart = any(law.least is not None and law.most is not None for law in self.laws[dof])
-        apart = apart or self.trace.piece is not None
+        apart = apart or not self.trace.exchange.alone
         return self._kept_as(GUESS if apart else GAIN, dof)
 
     def _kept_as(self, name: str, dof: int) -> Value:
-        return self.trace.graph.input(name, self._kept.get(dof, dof))
+        return self.trace.graph.input(name, self.trace.exchange.place_of(dof))
 
     def _stores_of_pass(self, gains: dict[int, Value]) -> list[Store]:
         """Return the stores at the end of a pass; none for a whole tree without bounded laws.
@@ -193,16 +188,17 @@ class Step:
         A piece has few registers left in its pass, so it checks its guesses afterwards with inputs that it reads anew.
         """
         bends = any(law.bends for laws in self.laws.values() for law in laws)
-        if not bends and self.trace.piece is None:
+        exchange = self.trace.exchange
+        if not bends and exchange.alone:
             return []
         stores, missed, found = [], [], []
         turns: list[list[Store]] = []
         for link in self.links:
             self.trace.label(link, "u")
             for dof in link.dofs:
-                gain, laws, at = gains[dof], self.laws[dof], self._kept.get(dof, dof)
+                gain, laws, at = gains[dof], self.laws[dof], exchange.place_of(dof)
                 found.append(Store(GAIN, (at,), gain))
-                if self.trace.piece is None:
+                if exchange.alone:
                     stores.append(found[-1])
                 else:
                     gain = self._kept_as(GAIN, dof)
@@ -219,9 +215,9 @@ class Step:
                     stores.append(Store(GUESS, (at,), select(self._waits(at), guess, after)))
                     turns[-1].append(stores[-1])
         stores += [Store(MISSED, (0,), total(missed))] if bends else []
-        if self.trace.piece is None:
+        if exchange.alone:
             return stores
-        self.trace.checks = list(map(_turn, turns)) if self._in_turns else [stores]
+        self.trace.checks = list(map(_turn, turns)) if exchange.laws_in_loops else [stores]
         return found
 
     def _waits(self, at: int) -> Value:
@@ -242,34 +238,35 @@ class Step:
         known = self._inputs() + self.trace.links.lost_values()
         return select(all_finite(known), select(self._rank_loss(), Status.LOOPS, word), Status.NOT_FINITE)
 
-    def _words(self, own: Piece, results: list[Value]) -> list[Store]:
+    def _words(self, results: list[Value]) -> list[Store]:
         """Return the stores that send a piece's status to the first piece, which stores the most severe of all."""
-        trace, graph = self.trace, self.trace.graph
-        graph.step = "status|s"
+        trace, exchange = self.trace, self.trace.exchange
+        trace.graph.step = "status|s"
         finite = select(all_finite(self._inputs()), select(all_finite(results), 0.0, Status.PIVOT), Status.NOT_FINITE)
-        if own.index == 0:
+        if exchange.is_first:
             worst: Value = 0.0
-            for piece in Pieces(trace.links).pieces:
-                (word,) = trace.receive("S", piece)
+            for piece in exchange.segments:
+                (word,) = exchange.receive("S", piece)
                 worst = select(less(worst, word), word, worst)
             word = self._verdict(worst)
             values = trace.links.lost_values()  # here, because texts of pieces of equal structure are equal
             word = select(all_finite(values), word, Status.NOT_FINITE) if values else word
             trace.rounds = [[Store("status", (), word)]]
-        return trace.send("S", own, [finite])
+        return exchange.send("S", exchange.own_segments[0], [finite])
 
     def add_bodies(self) -> None:
         """Let a piece store poses_out, velocities_out = body_poses, body_velocities of its bodies after the step.
 
         It reads the state after the step from the pieces that its bodies move with.
         """
-        trace, own = self.trace, self.trace.piece
-        assert own is not None, "by whole trees, another kernel computes the states of bodies"
+        trace, exchange = self.trace, self.trace.exchange
+        assert not exchange.alone, "by whole trees, another kernel computes the states of bodies"
+        own = exchange.own_segments[0]
         after = {(item.array, item.index[0]): item.value for item in trace.news if item.array in ("q_out", "out")}
-        trace.news = trace.news + trace.send("X", own, map(after.__getitem__, _entries(own)))
+        trace.news = trace.news + exchange.send("X", own, map(after.__getitem__, _entries(own)))
         sent: dict[tuple[str, int], Value] = {}
-        for piece in Pieces(trace.links).pieces:
-            sent |= dict(zip(_entries(piece), trace.receive("X", piece), strict=True))
+        for piece in exchange.segments:
+            sent |= dict(zip(_entries(piece), exchange.receive("X", piece), strict=True))
         moved = trace.at({"q": lambda c: sent["q_out", c], "qd": lambda dof: sent["out", dof]})
         found = [item._replace(array="poses_out") if item.array == "out" else item for item in body_states(moved)]
         trace.rounds = [*trace.rounds, found]
@@ -285,7 +282,7 @@ class Step:
         dofs = sorted(dof for link in self.links for dof in link.dofs)
         wide = ((link.coordinate, link.hinge.coordinates) for link in self.links)
         coordinates = sorted(first + c for first, count in wide for c in range(count))
-        own = {*map(id, trace.own_links)} | (set() if trace.piece and trace.piece.index else {id(None)})
+        own = {*map(id, trace.own_links)} | ({id(None)} if trace.exchange.is_first else set())
         bodies = sorted(body for body, seat in trace.links.seats.items() if id(seat.link) in own)
         for name in trace.inputs:
             if name in ("q", "target_q", "q_from"):
