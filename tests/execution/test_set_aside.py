@@ -112,5 +112,5 @@ def test_values_are_set_aside_where_blocks_have_room():
     assert choose(scene, 65536, MEASURED, "float32").places_aside(routine, size, 4, 4) == 0
     assert many.places_aside(routine, 2 * size, 8, 4) == 0
     assert many.places_aside(routine, 2 * size, 4, 4) == 0
-    assert many.places_aside(routine.bias_first, size, 4, 4) == 0
+    assert many.places_aside(routine.hints.bias_first, size, 4, 4) == 0
     assert choose(zoo.branched(3), 65536, MEASURED, "float32", varies=True).places_aside(routine, size, 4, 4) == 0

@@ -115,25 +115,27 @@ class Plan:
         """Return the granularity of one routine: the plan's own where the routine has that form."""
         if routine.name in self.instead:
             return self.instead[routine.name].of(routine)
-        if not routine.has_segment_form and not routine.has_node_form:
+        if routine.segments is None and not routine.has_node_form:
             return "tree"
         chosen = self.granularity if self.forced else self._rule(routine)
         if chosen == "segment":
-            return "segment" if routine.has_segment_form else "tree"
+            return "segment" if routine.segments is not None else "tree"
         return chosen if routine.has_node_form else "tree"
 
     def _rule(self, routine: Routine) -> str:
         if self.granularity == "node" or self.limbs == 1 or self.limbs > MOST_WARPS:
             return self.granularity
-        if routine.couples:
+        if routine.couples_bodies:
             few = self.alike and self.worlds <= self.device.scaled(ALIKE_WORLDS)
             return "segment" if few else "tree"
-        if routine.counted and not self.alike and self.dofs <= HELD:
+        if routine.is_counted and not self.alike and self.dofs <= HELD:
             return "tree"
-        if routine.long_result or routine.passes or routine.crowded:  # a thread holds too little even of a dozen dofs
+        if (
+            routine.hints.long_result or routine.passes is not None or routine.hints.crowded
+        ):  # a thread holds too little even of a dozen dofs
             return "segment"
         if self.granularity == "segment" and not self.few:
-            if routine.short or (not routine.velocities and self.dofs <= SOLVES[self.dtype]):
+            if routine.hints.short or (not routine.hints.velocities and self.dofs <= SOLVES[self.dtype]):
                 return "tree"
         return self.granularity
 
@@ -146,7 +148,7 @@ class Plan:
         first = self.of(routine)
         if self.forced or self.dofs > MOST_DOFS or not self.dofs:
             return (first,)
-        divides = self.device.cuda and routine.has_segment_form and 1 < self.limbs <= MOST_WARPS
+        divides = self.device.cuda and routine.segments is not None and 1 < self.limbs <= MOST_WARPS
         sweeps = routine.has_node_form and not self.device.cuda and self.worlds <= NODE_WORLDS
         found = ["tree", *["segment"] * divides, *["node"] * sweeps]
         return (first, *(name for name in found if name != first))
@@ -171,14 +173,14 @@ class Plan:
     def stages(self, routine: Routine, warps: int) -> bool:
         """Whether rows come in through shared memory, for kernels in which ``warps`` share 32 worlds."""
         enough = self.worlds > self.device.scaled(FEW_WORLDS // 4)
-        return self.at(routine).staged and (warps == 1 or enough or routine.passes)
+        return self.at(routine).staged and (warps == 1 or enough or routine.passes is not None)
 
     def copies_directly(self, routine: Routine) -> bool:
         """Whether rows reach shared memory without passing through registers, with a thread a world.
 
         They come sooner, but the compiler then takes more registers; that costs nothing where all worlds run at once.
         """
-        suits = routine.short or routine.waits_late
+        suits = routine.hints.short or routine.hints.waits_late
         return suits and not self.varies and not self.few and self.worlds <= self.device.scaled(AT_ONCE)
 
     def gathers(self, routine: Routine, warps: int, results: int) -> bool:
@@ -187,22 +189,22 @@ class Plan:
         ``warps`` share 32 worlds; ``results`` is the number of results.
         """
         if warps > 1:
-            return self.worlds > WARP_SIZE if self.dofs > LONG_ROWS else routine.collects
-        return results > FEW_RESULTS or (not self.few and (self.varies or routine.short))
+            return self.worlds > WARP_SIZE if self.dofs > LONG_ROWS else routine.hints.collects
+        return results > FEW_RESULTS or (not self.few and (self.varies or routine.hints.short))
 
     def places_aside(self, routine: Routine, shared_bytes: int, bytes_of: int, warps: int) -> int:
         """Return how many values each thread of a team sets aside in shared memory, to need fewer registers; 0: none.
 
-        As many as leave room for all the blocks that ``routine.aside`` registers allow. Measured on an H200,
+        As many as leave room for all the blocks that ``routine.hints.aside`` registers allow. Measured on an H200,
         2026-11-23: G1 with variable inertias takes 841 us for 919 at 2^20 worlds. With folded ones, and with a thread
         a world, the spills that they replace, or more registers, take less time.
 
         Args:
             shared_bytes: of the block without these values. bytes_of: of a value. warps: of the team.
         """
-        if not routine.aside or not self.varies or self.few or bytes_of > 4 or self.dofs <= SPILLS["float32"]:
+        if not routine.hints.aside or not self.varies or self.few or bytes_of > 4 or self.dofs <= SPILLS["float32"]:
             return 0
-        blocks = PARTS * (self.device.registers // PARTS // (WARP_SIZE * routine.aside)) // warps
+        blocks = PARTS * (self.device.registers // PARTS // (WARP_SIZE * routine.hints.aside)) // warps
         room = self.device.shared_bytes // max(blocks, 1) - 3 * RESERVED - shared_bytes  # Warp takes a share, too
         places = room // (WARP_SIZE * warps * bytes_of)
         return places if places >= PLACES else 0

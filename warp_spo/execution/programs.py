@@ -143,12 +143,12 @@ class Programs:
             return searches.build(self, routine, links, "given" in inputs, options)
         divides = routine.divides(self.run.scene, inputs, **options)
         shared = self.plan.of(routine) == "segment" and divides
-        if shared and routine.walks and self.builder.walks:
+        if shared and routine.segments and routine.segments.body_kinematics and self.builder.walks:
             return walks.build(self.builder, job, links)
-        if routine.bias_first is not None and self.plan.at(routine).apart and "qd" in inputs:
-            job = job._replace(routine=routine.bias_first)
+        if routine.hints.bias_first is not None and self.plan.at(routine).apart and "qd" in inputs:
+            job = job._replace(routine=routine.hints.bias_first)
         ways = [dict(alone=False)] if shared else []
-        if routine.couples and divides and not coupled.suits(links):
+        if routine.couples_bodies and divides and not coupled.suits(links):
             ways += [dict(alone=True), dict(alone=True, local=True)]
         pieces = Pieces(links) if ways else None
         for way in ways:

@@ -34,7 +34,7 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
     aggregates = any(item.array == coupled.TWIST for item in stores)
     kept = [Store("ahead", (), value) for value in trace.ahead] if looped else []  # may read what no store needs
     layout = builder.layout(job, outs, trace.begin + stores + kept)
-    once = routine.passes or any(item.array in LOOPED for item in stores)  # may write over what it reads
+    once = routine.passes is not None or any(item.array in LOOPED for item in stores)  # may write over what it reads
     layout = layout._replace(retries=not once and not layout.staged and layout.result.way in (DIRECT, TILED, RELAYED))
     placed, table = staging.arrange_stores(outs, layout.result)
     placed += apart
@@ -60,7 +60,7 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
         ahead, a_pass = before
         body = pass_loops.repeat_passes(ahead, a_pass, body, LOOPED, run.scene.dof_count, run.dtype)
     direct = layout.staged and plan.copies_directly(routine)
-    late = direct and routine.waits_late
+    late = direct and routine.hints.waits_late
     block = PAIR * WARP_SIZE if late or (plan.few and not layout.shared_scalars) else WARP_SIZE
     layout = layout._replace(retries=layout.retries and "farthest" in body, block=block, direct=direct, late=late)
     cuda = cpu = body

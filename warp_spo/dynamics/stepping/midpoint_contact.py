@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import warp as wp
 
-from ...execution.routine import Routine
+from ...execution.routine import PassForm, Routine, SegmentForm
 from ...kernels.status import mark_unsettled
 from ...recursions.contact import step as contact
 from ...recursions.contact.velocity_kicks import FOUND, GAINED, KICK, KICKED, PATH, START, last_kick, middle_kick
@@ -25,9 +25,11 @@ if TYPE_CHECKING:
 MANY = 4  # passes from which on a step is made in rounds
 ROUNDS = 2
 UNSETTLED = 0.1  # share of the largest rate by which the end may change a rate without a word
-CONTACT_STEP = Routine("contact_step", contact.step, letters="PzafSE", passes=True, counted=True, wide=True)
-MIDDLE_KICK = Routine("middle_kick", middle_kick, letters="fPza")
-LAST_KICK = Routine("last_kick", last_kick, letters="fPza")
+CONTACT_STEP = Routine(
+    "contact_step", contact.step, segments=SegmentForm(messages="PzafSE", wide=True), passes=PassForm(counted=True)
+)
+MIDDLE_KICK = Routine("middle_kick", middle_kick, segments=SegmentForm(messages="fPza"))
+LAST_KICK = Routine("last_kick", last_kick, segments=SegmentForm(messages="fPza"))
 INTEGRATE_VJP = Routine("integrate_vjp", adjoints.integrate_vjp)
 
 

@@ -104,11 +104,13 @@ class _Limbs:
         self.builder, self.job, self.pieces, self.alone, self.local = builder, job, pieces, alone, local
         self.run, self.plan, self.dtype = builder.run, builder.plan, builder.dtype
         self.schedule = Schedule(pieces)
-        self.letters = messages.needed(job.routine.letters, job.shapes)
+        assert job.routine.segments is not None
+        self.form = job.routine.segments
+        self.letters = messages.needed(self.form.messages, job.shapes)
         self.slots, self.sent = messages.slots(self.letters, pieces)
-        self.couples = self._couples() if job.routine.couples else None
+        self.couples = self._couples() if self.form.couples_bodies else None
         self.sent = self.couples.layout["end"] if self.couples is not None else self.sent
-        self.unfolds = not job.routine.couples  # constants in which limbs differ may be kept from folding
+        self.unfolds = not self.form.couples_bodies  # constants in which limbs differ may be kept from folding
 
     def build(self) -> Program | None:
         """Return the program; of two, with constants that fold and with some that do not, that with fewer texts."""
@@ -165,7 +167,7 @@ class _Limbs:
         traced = [self._trace(index, unfolded[index]) for index in range(len(pieces.pieces))]
         everything = [item for one in traced for item in one.everything]
         bends = any(item.array == MISSED for item in everything)
-        if not (bends or routine.counted):
+        if not (bends or routine.is_counted):
             traced = [one._replace(held=[]) for one in traced]
         passes = self._passes(traced, bends)
         sent = self.sent + (2 * schedule.warps if bends else 0)
@@ -188,10 +190,10 @@ class _Limbs:
     def _passes(self, traced: list[Traced], bends: bool) -> Passes | None:
         """Return how the work is repeated; ``bends``: guesses of a pass may turn out wrong."""
         sizes = {index: len(one.held) for index, one in enumerate(traced)}
-        if self.job.routine.counted:
+        if self.job.routine.is_counted:
             counts = [sum(item.array == SECANT for item in one.begin) for one in traced]
             return Passes((GAIN,), None, sizes, dict(enumerate(counts)))
-        if not self.job.routine.passes:
+        if self.job.routine.passes is None:
             return None
         kept = (GUESS, GAIN, FORCE, RESISTANCE) if any(one.laws for one in traced) else (GUESS, GAIN)
         return Passes(kept, self.sent if bends else None, sizes)
@@ -201,10 +203,10 @@ class _Limbs:
 
         The result without room matters more than a thread a limb; another kernel then writes the states of bodies.
         """
-        routine, options = self.job.routine, self.job.options
+        form, options = self.form, self.job.options
         if layout.result.way == DIRECT and layout.result.array.entries > staging.LONG_ROW:
             return False
-        if not layout.fits(self.run.dtype, self.builder.room(routine.wide, routine.couples, BODIES in options)):
+        if not layout.fits(self.run.dtype, self.builder.room(form.wide, form.couples_bodies, BODIES in options)):
             return False
         return not options.get(BODIES) or bool(layout.further_staged)
 
@@ -224,7 +226,7 @@ class _Limbs:
         later = emitter() if team.passes else sweeps
         ahead = first.region([*one.begin, *(Store(HELD, (at,), value) for at, value in enumerate(one.held))])
         sweeps.keep(HELD, one.held)
-        if routine.counted:
+        if routine.is_counted:
             later.keep(HELD, one.held)  # other pieces may have written over what these come from
         inward = [item for item in one.stores if item.array == INWARD]
         outward = [item for item in one.stores if item.array == OUTWARD]
@@ -258,7 +260,7 @@ class _Limbs:
         if places := self.plan.places_aside(
             routine, layout.shared_bytes(T), wp.types.type_size_in_bytes(T), layout.warps
         ):
-            layout, registers = layout._replace(aside=places), routine.aside
+            layout, registers = layout._replace(aside=places), routine.hints.aside
             cuda = set_aside(cuda, C_TYPE[T], places)
         lists = {"place": table, "table": team.shared.table, "shifts": team.shared.shifts}
         tables = {name: values for name, values in lists.items() if values} | self.builder.height_tables(looks_up)
@@ -271,7 +273,7 @@ class _Limbs:
         """Return how many registers a thread may take, so that a multiprocessor holds as many blocks as help."""
         warps = 1 if self.alone else self.schedule.warps
         if self.dtype == "float32" and not self.plan.few:
-            for blocks, enough in self.job.routine.occupancy:
+            for blocks, enough in self.job.routine.hints.occupancy:
                 fewer = self._shared_registers(blocks * self.schedule.warps)
                 room = blocks * (layout.shared_bytes(self.run.dtype) + RESERVED) <= self.plan.device.shared_bytes
                 if fewer >= enough and room:
