@@ -218,7 +218,7 @@ BUGS = {
     "a point that nobody takes": (points, "points_of", "first * each", "(first + 1) * each"),
     "a point that two take": (points, "points_of", "mine[each * len(piece.children) :]", "mine"),
     "what a message leaves out": (SegmentExchange, "add_contacts", "z - pushes[key]", "z"),
-    "excess of one limb": (step.ContactStep, "_sent_to_the_first", "largest(list(values))", "values[0]"),
+    "excess of one limb": (step.ContactStep, "_send_to_the_first", "largest(list(values))", "values[0]"),
     "no barrier after the passes": (pass_loops, "count_team_passes", '"}", barrier]', '"}"]'),
     "no barrier ahead": (teams.Team, "_ahead", "[BARRIER] if stage else []", "[]"),
 }

@@ -7,6 +7,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+from ..recursions.step.phases import StepPhases
 from ..trace.emission import Store
 
 VARIANTS = 16  # different options, such as lists of frames, that get a kernel of their own
@@ -86,7 +87,7 @@ class Routine:
 
     Attributes:
         name: name of the kernel.
-        trace: ``trace(trace, **options)`` returns the values that the kernel stores, see :mod:`warp_spo.recursions`.
+        trace: ``trace(trace, **options)`` returns what the kernel stores, see :mod:`warp_spo.recursions`.
         sweeps: ``sweeps(run, out, **arrays)`` launches the same computation at node granularity; None: there is only
             the traced kernel of the scene.
         blocks: at node granularity the caller applies stored blocks instead of this routine.
@@ -101,7 +102,7 @@ class Routine:
     """
 
     name: str
-    trace: Callable[..., list[Store]]
+    trace: Callable[..., list[Store] | StepPhases]
     sweeps: Callable[..., None] | None = None
     blocks: bool = False
     suits: Callable[..., bool] = _always

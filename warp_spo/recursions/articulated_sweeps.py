@@ -17,6 +17,7 @@ from .newton_euler import link_acceleration
 
 if TYPE_CHECKING:
     from .model.tracing import Trace
+    from .step.phases import PhaseBuilder
 
 Factors = dict[int, Any]
 """The factor of every link by id, of :mod:`.articulated`; at the leader of a group the factor of :mod:`.groups`."""
@@ -82,13 +83,19 @@ def inside(trace: Trace, child: Link, done: dict) -> tuple[Pose, Articulated]:
 
 
 def reduce(
-    trace: Trace, tau: Callable[[int], Value], moves: bool, loads: bool, letters: str = "Pz"
+    trace: Trace,
+    tau: Callable[[int], Value],
+    moves: bool,
+    loads: bool,
+    letters: str = "Pz",
+    phases: PhaseBuilder | None = None,
 ) -> tuple[dict, dict, list[Store]]:
     """Sweep inward: return the factors, D^-1 [I - H psi K] (tau - velocity terms - loads), and the stores that send.
 
     Args:
         tau: force of a dof. moves: links have velocities. loads: subtract the external wrenches.
         letters: of the messages to other pieces; "P" among them sends the articulated inertias.
+        phases: receives what does not change from pass to pass, where passes repeat the sweep.
     """
     done: Factors = {}
     rates: dict[int, list[Value]] = {}
@@ -107,8 +114,9 @@ def reduce(
         z = articulated.gyroscopic(link.inertia, move)
         if loads:
             z = z - trace.external_wrench(link)
-        bias = *move.bias_w, *move.bias_v, *move.bias_l
-        trace.ahead += [*(place.pose.turn or ()), *bias, *z]  # the passes of a step share them
+        if phases is not None:
+            bias = *move.bias_w, *move.bias_v, *move.bias_l
+            phases.add_invariants([*(place.pose.turn or ()), *bias, *z])
         if key in trace.pushes:
             z = z - trace.pushes[key]
         for force in trace.exchange.from_children(link, letters[-1], forces, Vector):

@@ -17,6 +17,7 @@ from .articulated_sweeps import NO_FORCE, factor, factor_tree, mirror, pack, piv
 from .model.links import Link
 from .model.segments import Piece
 from .motion import STILL
+from .step.phases import PhaseBuilder, StepPhases
 
 if TYPE_CHECKING:
     from .model.tracing import Trace
@@ -121,15 +122,22 @@ def _sixes(values: list[Value]) -> list[list[Value]]:
     return [values[i : i + 6] for i in range(0, len(values), 6)]
 
 
-def mass_matrix_inverse(trace: Trace) -> list[Store]:
+def mass_matrix_inverse(trace: Trace) -> list[Store] | StepPhases:
     """out = Mass^-1, both triangles"""
-    if trace.links.shared:
-        return by_columns(trace)
+    if trace.exchange.alone:
+        return by_columns(trace) if trace.links.shared else _by_segments(trace)
+    inverse, phases = Inverse(trace), PhaseBuilder()
+    for entries in inverse.rounds:
+        phases.add_final_stores(mirror(entries))
+    phases.add_final_messages(inverse.news)
+    phases.add_sweep(inverse.stores + mirror(inverse.entries))
+    return phases.phases
+
+
+def _by_segments(trace: Trace) -> list[Store]:
+    """out = Mass^-1, both triangles, where one evaluation takes all segments"""
     inverse = Inverse(trace)
-    rounds = [mirror(entries) for entries in inverse.rounds]
-    if not trace.exchange.alone:
-        trace.rounds, trace.news, rounds = rounds, inverse.news, []
-    return inverse.stores + mirror(inverse.entries) + [item for stores in rounds for item in stores]
+    return mirror(inverse.entries) + [item for entries in inverse.rounds for item in mirror(entries)]
 
 
 def by_columns(trace: Trace) -> list[Store]:
@@ -145,4 +153,4 @@ def by_columns(trace: Trace) -> list[Store]:
 
 def mass_matrix_inverse_packed(trace: Trace) -> list[Store]:
     """out = the entries of Mass^-1 within one tree, lower triangle, row after row"""
-    return pack(mass_matrix_inverse(trace))
+    return pack(by_columns(trace) if trace.links.shared else _by_segments(trace))

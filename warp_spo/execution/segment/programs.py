@@ -24,6 +24,7 @@ from ...recursions.model.exchange import SegmentExchange
 from ...recursions.model.messages import INWARD, OUTWARD
 from ...recursions.model.segments import Piece, Pieces
 from ...recursions.model.tracing import Trace
+from ...recursions.step.phases import StepPhases, as_phases
 from ...recursions.step.step import FORCE, GAIN, GUESS, MISSED, RESISTANCE
 from ...trace.emission import Emitter, Store, under
 from ...trace.register_spilling import set_aside
@@ -41,22 +42,15 @@ BODIES = "bodies"  # option of a step by limbs whose kernel writes the states of
 
 
 class Traced(NamedTuple):
-    """The stores of the work on one piece.
+    """The work on one piece.
 
     Attributes:
-        stores: what its trace returns.
-        begin: what it stores and sends before the passes. held: what it computes once before them.
-        laws, checks, news, rounds, couples, carried: as of a :class:`~warp_spo.recursions.model.tracing.Trace`.
+        phases: what its evaluation stores.
+        couples, carried: of the code that couples bodies, as of a :class:`~warp_spo.recursions.model.tracing.Trace`.
         numbers: its constants, where they may be kept from folding.
     """
 
-    stores: list[Store]
-    begin: list[Store]
-    held: list[Scalar]
-    laws: list[list[Store]]
-    checks: list[list[Store]]
-    news: list[Store]
-    rounds: list[list[Store]]
+    phases: StepPhases
     couples: list[tuple[int, list[Store]]]
     carried: list[Value]
     numbers: alike.Numbers | None
@@ -64,8 +58,7 @@ class Traced(NamedTuple):
     @property
     def everything(self) -> list[Store]:
         """All stores of a piece."""
-        turns = (*self.laws, *self.checks, *self.rounds, *(items for _, items in self.couples))
-        return [*self.begin, *self.stores, *self.news, *(item for turn in turns for item in turn)]
+        return [*self.phases.everything, *(item for _, items in self.couples for item in items)]
 
 
 class Gathered(NamedTuple):
@@ -145,20 +138,16 @@ class _Limbs:
         def flat(items: list[Store]) -> list[Store]:
             return [flatten(item, shapes) for item in items]
 
-        stores = flat(self.job.routine.trace(trace, **options))
-        found = Traced(
-            stores=stores,
-            begin=trace.begin,
-            held=trace.ahead,
-            laws=trace.laws,
-            checks=trace.checks,
-            news=flat(trace.news),
-            rounds=[flat(turn) for turn in trace.rounds],
-            couples=trace.couples,
-            carried=trace.carried,
-            numbers=links.numbers if self.unfolds else None,
+        phases = as_phases(self.job.routine.trace(trace, **options))
+        phases = phases._replace(
+            sweep=flat(phases.sweep),
+            epilogue=flat(phases.epilogue),
+            final_messages=flat(phases.final_messages),
+            final_stores=[flat(group) for group in phases.final_stores],
         )
-        return found._replace(held=_read(found.held, [*found.everything][len(found.begin) :]))
+        found = Traced(phases, trace.couples, trace.carried, links.numbers if self.unfolds else None)
+        used = _read(phases.pass_invariants, found.everything[len(phases.prologue) :])
+        return found._replace(phases=phases._replace(pass_invariants=used))
 
     def _gather(self, unfolded: list[frozenset]) -> Gathered | None:
         """Return the work of all pieces, None if there is no room; ``unfolded``: by piece, see :meth:`_trace`."""
@@ -168,7 +157,7 @@ class _Limbs:
         everything = [item for one in traced for item in one.everything]
         bends = any(item.array == MISSED for item in everything)
         if not (bends or routine.is_counted):
-            traced = [one._replace(held=[]) for one in traced]
+            traced = [one._replace(phases=one.phases._replace(pass_invariants=[])) for one in traced]
         passes = self._passes(traced, bends)
         sent = self.sent + (2 * schedule.warps if bends else 0)
         whole = [item for item in everything if item.array == "out"]
@@ -178,7 +167,7 @@ class _Limbs:
             return None
         declared = "" if self.couples is None else coupling_teams.declare(self.couples, self.run.dtype, self.local)
         team = Team(schedule, self.dtype, passes, declared)
-        outs = [[item for item in one.stores if item.array == "out"] for one in traced]
+        outs = [[item for item in one.phases.sweep if item.array == "out"] for one in traced]
         placed, table = staging.arrange_stores(whole, layout.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
         looks_up = False
@@ -189,13 +178,13 @@ class _Limbs:
 
     def _passes(self, traced: list[Traced], bends: bool) -> Passes | None:
         """Return how the work is repeated; ``bends``: guesses of a pass may turn out wrong."""
-        sizes = {index: len(one.held) for index, one in enumerate(traced)}
+        sizes = {index: len(one.phases.pass_invariants) for index, one in enumerate(traced)}
         if self.job.routine.is_counted:
-            counts = [sum(item.array == SECANT for item in one.begin) for one in traced]
+            counts = [sum(item.array == SECANT for item in one.phases.prologue) for one in traced]
             return Passes((GAIN,), None, sizes, dict(enumerate(counts)))
         if self.job.routine.passes is None:
             return None
-        kept = (GUESS, GAIN, FORCE, RESISTANCE) if any(one.laws for one in traced) else (GUESS, GAIN)
+        kept = (GUESS, GAIN, FORCE, RESISTANCE) if any(one.phases.laws for one in traced) else (GUESS, GAIN)
         return Passes(kept, self.sent if bends else None, sizes)
 
     def _fits(self, layout: KernelLayout) -> bool:
@@ -215,6 +204,7 @@ class _Limbs:
     ) -> bool:
         """Add the statements of a piece to the team, ``outs`` of its stores; return whether it reads heights."""
         routine, shapes, more, _ = self.job
+        phases, held = one.phases, one.phases.pass_invariants
 
         def emitter() -> Emitter:
             return make_emitter(self.dtype, shapes, layout, True)
@@ -224,22 +214,24 @@ class _Limbs:
 
         first, sweeps, ruling, checking = (emitter() for _ in range(4))
         later = emitter() if team.passes else sweeps
-        ahead = first.region([*one.begin, *(Store(HELD, (at,), value) for at, value in enumerate(one.held))])
-        sweeps.keep(HELD, one.held)
+        ahead = first.region([*phases.prologue, *(Store(HELD, (at,), value) for at, value in enumerate(held))])
+        sweeps.keep(HELD, held)
         if routine.is_counted:
-            later.keep(HELD, one.held)  # other pieces may have written over what these come from
-        inward = [item for item in one.stores if item.array == INWARD]
-        outward = [item for item in one.stores if item.array == OUTWARD]
+            later.keep(HELD, held)  # other pieces may have written over what these come from
+        inward = [item for item in phases.sweep if item.array == INWARD]
+        outward = [item for item in phases.sweep if item.array == OUTWARD]
         last = outward if set(self.letters) & set(messages.OUTWARD_LETTERS) else inward
         last += by_slot(outs)
-        last += [item for item in one.stores if item.array in (*more, GAIN, SECANT)]
+        last += [item for item in phases.sweep if item.array in (*more, GAIN, SECANT)]
         sweep = sweeps.region(inward, one.carried)
         couples = [under(sweeps.branch(items), "SENT({}) > 0", INWARD, flag) for flag, items in one.couples]
         back = sweeps.region(outward)
-        ends = [item for item in one.news if item.array == "out"]
-        news = later.branch([item for item in one.news if item.array != "out"] + by_slot(ends))
-        rounds = [later.branch(by_slot(turn)) for turn in one.rounds]
-        laws, checks = [ruling.branch(turn) for turn in one.laws], [checking.branch(turn) for turn in one.checks]
+        after = [*phases.epilogue, *phases.final_messages]
+        ends = [item for item in after if item.array == "out"]
+        news = later.branch([item for item in after if item.array != "out"] + by_slot(ends))
+        rounds = [later.branch(by_slot(group)) for group in phases.final_stores]
+        laws, checks = ([each.branch(group) for group in groups]
+                        for each, groups in ((ruling, phases.laws), (checking, phases.checks)))  # fmt: skip
         emitters = {first, sweeps, later, ruling, checking}
         work = Work(
             piece, self.schedule.assignments[piece.index], sweep, back, laws, checks, news, rounds, ahead, couples

@@ -23,6 +23,7 @@ from ..model.links import Link, Links
 from ..model.messages import INWARD, OUTWARD
 from ..model.segments import Piece, Pieces
 from ..motion import STILL
+from ..step.phases import StepPhases
 from .coupled import CoupledStep, suits
 from .couples import EXCESS, Team
 from .pairs import (
@@ -121,13 +122,12 @@ class PairedPiece(ContactStep):
         self.own = {number: body for number, (body, limb) in mine if limb.index == trace.piece.index}
         self.is_base = seats.base is not None and seats.base.index == trace.piece.index
 
-    def stores(self, qdd: bool, status: bool) -> list[Store]:
-        """Return the stores of a pass; ``trace.couples`` are those that only couples that touch need."""
+    def stores(self, qdd: bool, status: bool) -> StepPhases:
+        """Return the stores of the step; ``trace.couples`` are those that only couples that touch need."""
         self.first: list[Store] = []
         self.twists: list[Store] = []
         found = super().stores(qdd, status)
-        self.trace.begin = [*self.trace.begin, *self.first]
-        return found + self.twists
+        return found._replace(prologue=found.prologue + self.first, sweep=found.sweep + self.twists)
 
     # -- before the passes -----------------------------------------------------------------------------------------
     def _press(self, points: list[Point], touches: list[Touch]) -> None:
@@ -151,7 +151,7 @@ class PairedPiece(ContactStep):
             trace.label(link, f"T{number}_")
             (w, v), R = self.before[id(link)], trace.axes[id(link)]
             self._store(self.first, "twist", number, 6, (*velocity(R, w, v, arm), *(R @ w)))
-            trace.ahead += [*(entry for row in R for entry in row), *w, *v]
+            self.phases.add_invariants([*(entry for row in R for entry in row), *w, *v])
             self._add_push(link, self._wrench(number, INWARD))
         if self.is_base:
             link = trace.piece.links[-1]
@@ -285,7 +285,7 @@ class PairedPiece(ContactStep):
         return stores
 
 
-def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> list[Store]:
+def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> StepPhases:
     """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world; and the ``reports``"""
     alone = CoupledStep if suits(trace.links) else PairedStep
     form = alone if trace.piece is None else PairedPiece

@@ -24,6 +24,7 @@ from ..kinematics import zero
 from ..model.links import Link
 from ..newton_euler import inverse_dynamics
 from ..step.joint_laws import Law, add_laws
+from ..step.phases import StepPhases
 from ..step.step import GAIN, Step
 from .contact_culling import Crowd, gather
 from .dampers import SEVERAL, chosen, damper, load
@@ -68,12 +69,9 @@ class ContactStep(Step):
         self.excess: list[Value] = []  # of cone, adhesion, effort; largest push of a point that the last pass left open
         self.finished: dict[str, list[Store]] = {name: [] for name in reports}
 
-    def stores(self, qdd: bool, status: bool) -> list[Store]:
-        """Return the stores of a pass, then those after the last one; ``trace.begin`` are those before the first.
-
-        For a piece, those after the last pass are the trace's ``news``.
-        """
-        trace, kept = self.trace, self.kept
+    def stores(self, qdd: bool, status: bool) -> StepPhases:
+        """Return the stores before the first pass, those of a pass, and those after the last one."""
+        trace, kept, phases = self.trace, self.kept, self.phases
         bias, sent_ahead = self._bias()
         points, touches, candidates = [], [], []
         alone = trace.exchange.alone  # limbs side by side are for GPUs, where branches cost more than they spare
@@ -84,9 +82,9 @@ class ContactStep(Step):
             candidates.append(first[1])
         self._gather(points, touches, candidates)
         arms = keeps_arms(trace)
-        trace.ahead = [*bias.values()]
-        trace.ahead += [value for point in points for value in point.state(arms)]
-        trace.ahead += [value for crowd in self.crowds.values() for value in (crowd.highest, crowd.reach)]
+        phases.add_invariants(bias.values())
+        phases.add_invariants(value for point in points for value in point.state(arms))
+        phases.add_invariants(value for crowd in self.crowds.values() for value in (crowd.highest, crowd.reach))
         self._press(points, touches)
         trace.stiffened = self._with_resistance
         tau = trace.vector("tau")
@@ -110,16 +108,15 @@ class ContactStep(Step):
         forces = self._forces(points, touches, alpha, excess)
         for number, surfaces in forces.items():
             self._report(number, surfaces)
-        trace.ahead += [item.value for item in self.finished.get("contact_gap", ())]  # of the state before the step
+        gaps = self.finished.get("contact_gap", ())
+        phases.add_invariants(item.value for item in gaps)  # of the state before the step
         if status or "contact_excess" in self.reports:
             trace.graph.step = "excess|e"
             self.excess = [self._last(largest(values)) for values in (*excess[:2], efforts, excess[2])]
-        trace.begin = sent_ahead + kept.begin
-        after = self._after(qdd, status)
-        if trace.exchange.alone:
-            return passed + kept.end + after
-        trace.news = after
-        return sent + passed + kept.end
+        phases.add_prologue(sent_ahead + kept.begin)
+        phases.add_epilogue(self._after(qdd, status))
+        phases.add_sweep(sent + passed + kept.end)
+        return phases.phases
 
     def _forces(
         self, points: list[Point], touches: list[Touch], alpha: dict, excess: tuple[list[Value], ...]
@@ -151,7 +148,7 @@ class ContactStep(Step):
 
     def inward(self, tau: Callable[[int], Value]) -> tuple[Factors, dict, list[Store]]:
         """Return factors and D^-1 eps of a pass by link, for forces of the dofs, and the stores that send."""
-        return reduce(self.trace, tau, moves=False, loads=False)
+        return reduce(self.trace, tau, moves=False, loads=False, phases=self.phases)
 
     def outward(self, done: Factors, rates: dict, alpha: dict[int, tuple[Vector, Vector]]) -> list[Store]:
         """Return the stores of qdd; ``alpha`` receives the accelerations of links by id."""
@@ -318,7 +315,8 @@ class ContactStep(Step):
         for name in self.reports:
             stores += self.finished[name]
         if not trace.exchange.alone:
-            return stores + self._sent_to_the_first(results, status)
+            self._send_to_the_first(results, status)
+            return stores
         if self.excess and any(more := self.last_excess()):
             self.excess = [largest([own, *others]) for own, others in zip(self.excess, more, strict=True)]
         stores += self._excess_stores()
@@ -327,20 +325,20 @@ class ContactStep(Step):
             stores.append(Store("status", (), self._verdict(self._word(results, False))))
         return stores
 
-    def _sent_to_the_first(self, results: list[Value], status: bool) -> list[Store]:
-        """Return the stores that send a piece's excess and status to the first piece, which stores the world's."""
-        trace, exchange, sent = self.trace, self.trace.exchange, []
+    def _send_to_the_first(self, results: list[Value], status: bool) -> None:
+        """Send a piece's excess and status to the first piece, which stores the world's."""
+        exchange, phases = self.trace.exchange, self.phases
         if self.excess:
-            sent += exchange.send("E", exchange.own_segments[0], self.excess)
+            phases.add_final_messages(exchange.send("E", exchange.own_segments[0], self.excess))
             if exchange.is_first:
                 sent_by = zip(*(exchange.receive("E", piece) for piece in exchange.segments), strict=True)
                 kinds = ((*values, *more) for values, more in zip(sent_by, self.last_excess(), strict=True))
                 self.excess = [largest(list(values)) for values in kinds]
-        sent += self._words(results) if status else []
-        first = [*self._excess_stores(), *self.reported()] if exchange.is_first else []
-        if first:
-            trace.rounds = [[*first, *(item for turn in trace.rounds for item in turn)]]
-        return sent
+        sent, word = self._words(results) if status else ([], [])
+        phases.add_final_messages(sent)
+        last = [*self._excess_stores(), *self.reported(), *word] if exchange.is_first else []
+        if last:
+            phases.add_final_stores(last)
 
     def _excess_stores(self) -> list[Store]:
         asked = self.excess[:3] if "contact_excess" in self.reports else []
@@ -370,6 +368,6 @@ class ContactStep(Step):
         return super()._inputs() + [value for value in values if not is_constant(value)]
 
 
-def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> list[Store]:
+def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> StepPhases:
     """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world; and the ``reports``"""
     return ContactStep(trace, reports).stores(qdd, status)

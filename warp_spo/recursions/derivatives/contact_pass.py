@@ -127,14 +127,13 @@ class OnePass(ContactStep):
         """Return the stores of what the pass leaves, and messages to other pieces."""
         trace = self.trace
         dofs = {trace.exchange.place_of(dof): dof for dof in self.before}
-        stores = self.stores(qdd=False, status=False)
-        sent = [item for item in trace.begin if item.array != ROW]
-        trace.begin, trace.ahead, trace.news, trace.rounds = [], [], [], []  # there is no loop
-        after = (GAIN, "out", "q_out", *(item.array for item in self.kept.end))
-        sent += [item for item in stores if item.array not in after]
+        found = self.stores(qdd=False, status=False)
+        sent = [item for item in found.prologue if item.array != ROW]
+        after = (GAIN, *(item.array for item in self.kept.end))
+        sent += [item for item in found.sweep if item.array not in after]
         gains = [
             Store("out", (dofs[item.index[0]],), item.value * reciprocal(self.h))
-            for item in stores
+            for item in found.sweep
             if item.array == GAIN
         ]
         return sent + gains + self.kept.end

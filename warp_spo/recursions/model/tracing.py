@@ -36,14 +36,8 @@ class Trace:
         places: by id of the link: its placement. motions: its velocity terms. axes: its axes in the inertial frame.
         compensates: external wrenches hold up the bodies' ``gravcomp``, as forces of the hinges do.
         stiffened: returns a link with what a time step adds to its armature.
-        news: messages that a piece sends apart from the others, because pieces of equal structure do not all send them.
-        rounds: what a piece stores after it has received all news, in turns of which many may be alike.
-        ahead: values that the passes of a loop share, formed once before the loop.
-        begin: stores before the passes of a loop, of the variables that they read.
         dampers, pushes: by id of the link: what contacts add to its articulated inertia, and to the forces on it; of a
             piece also for the link that it moves on.
-        laws: in turns of which many may be alike, stores before each pass: the laws of a dof at its guess.
-        checks: in such turns or in one, stores that check a pass; they read their inputs anew, which keeps no register.
         instead: entries that take the place of those of an array, by its name.
         team: of a piece, the pairs of bodies that native code couples between its sweeps. couples: what it stores for
             each couple of bodies that touches, and the entry that says so; carried: values that both sweeps use.
@@ -58,14 +52,8 @@ class Trace:
     ):
         self.links, self.graph, self.epsilon, self.inputs = links, links.graph, EPSILON[dtype], inputs
         self.exchange = WholeTree(links) if exchange is None else exchange
-        self.news: list[Store] = []
-        self.rounds: list[list[Store]] = []
-        self.ahead: list[Value] = []
-        self.begin: list[Store] = []
         self.dampers: dict[int, Articulated] = {}
         self.pushes: dict[int, Vector] = {}
-        self.laws: list[list[Store]] = []
-        self.checks: list[list[Store]] = []
         self.instead: dict[str, Callable[[int], Value]] = {}
         self.team: Any = None
         self.couples: list[tuple[int, list[Store]]] = []

@@ -28,6 +28,7 @@ from ..model.tracing import Trace
 from .actuation import hinge_laws
 from .joint_laws import Law, add_laws, is_number
 from .joint_space import JointSpace
+from .phases import PhaseBuilder, StepPhases
 
 GUESS, GAIN, MISSED, PASS = "guess", "gain", "missed", "pass"
 """Variables of the loop over passes, zero at first: guess of u, and u, by dof of a piece; number of wrong guesses. And
@@ -58,14 +59,12 @@ class Step:
         self.laws: dict[int, list[Law]] = {}  # by dof
         self.forces: dict[int, Value] = {}
         self.messages: list[Store] = []  # to other pieces
+        self.phases = PhaseBuilder()
         if trace.exchange.laws_in_loops:
             reciprocal(self.h)  # older than what turns compute alone
 
-    def stores(self, qdd: bool, status: bool) -> list[Store]:
-        """Return the stores out = qd', q_out = q'; with ``qdd`` qdd_out = (qd' - qd) / h, with ``status`` the status.
-
-        For a piece, the stores of one pass; stores after the last pass are the trace's ``news``.
-        """
+    def stores(self, qdd: bool, status: bool) -> StepPhases:
+        """Return the stores out = qd', q_out = q'; with ``qdd`` qdd_out = (qd' - qd) / h; with ``status`` that word."""
         trace = self.trace
         trace.stiffened = self._with_resistance
         tau = trace.vector("tau")
@@ -86,18 +85,23 @@ class Step:
         stores = self.put_back(stores)
         results = [item.value for item in stores]
         if not trace.exchange.alone:
-            trace.news = stores + (self._words(results) if status else [])
-            return self.messages + looped
-        if status:
+            if status:
+                sent, word = self._words(results)
+                self.phases.add_final_messages(sent)
+                if word:
+                    self.phases.add_final_stores(word)
+        elif status:
             trace.graph.step = "status|s"
             stores.append(Store("status", (), self._word(results, bool(looped))))
-        return looped + stores
+        self.phases.add_sweep(self.messages + looped)
+        self.phases.add_epilogue(stores)
+        return self.phases.phases
 
     def _accelerations(self, tau: Callable[[int], Value]) -> dict[int, Value]:
         """Return qdd by dof for ``tau``, with the resistances of the active pieces added to Mass."""
         if self._is_short:
             return self._in_joint_space(tau)
-        done, rates, sent = reduce(self.trace, tau, moves=True, loads=True)
+        done, rates, sent = reduce(self.trace, tau, moves=True, loads=True, phases=self.phases)
         stores = sent + expand(self.trace, done, rates, self.trace.base_acceleration)
         self.messages = [item for item in stores if item.array != "out"]
         return {item.index[0]: item.value for item in stores if item.array == "out"}
@@ -113,7 +117,7 @@ class Step:
         """Return the same from a system that is formed once for all passes."""
         system = JointSpace(self.trace)
         pieces: dict[int, Law] = {}
-        self.trace.ahead = [*system.mass.values(), *system.bias.values()]
+        self.phases.add_invariants([*system.mass.values(), *system.bias.values()])
         for link in self.links:
             self.trace.label(link, "r")
             pieces.update(zip(link.dofs, self._pieces(link), strict=True))
@@ -153,7 +157,7 @@ class Step:
         if not any(law.bends for law in self.laws[dof]):
             return piece
         at = (self.trace.exchange.place_of(dof),)
-        self.trace.laws.append(_turn([Store(FORCE, at, piece.force), Store(RESISTANCE, at, piece.resistance)]))
+        self.phases.add_law(_turn([Store(FORCE, at, piece.force), Store(RESISTANCE, at, piece.resistance)]))
         return Law(self._kept_as(FORCE, dof), self._kept_as(RESISTANCE, dof))
 
     def _weightless(self, link: Link) -> bool:
@@ -217,7 +221,8 @@ class Step:
         stores += [Store(MISSED, (0,), total(missed))] if bends else []
         if exchange.alone:
             return stores
-        self.trace.checks = list(map(_turn, turns)) if exchange.laws_in_loops else [stores]
+        for group in map(_turn, turns) if exchange.laws_in_loops else [stores]:
+            self.phases.add_check(group)
         return found
 
     def _waits(self, at: int) -> Value:
@@ -238,11 +243,12 @@ class Step:
         known = self._inputs() + self.trace.links.lost_values()
         return select(all_finite(known), select(self._rank_loss(), Status.LOOPS, word), Status.NOT_FINITE)
 
-    def _words(self, results: list[Value]) -> list[Store]:
-        """Return the stores that send a piece's status to the first piece, which stores the most severe of all."""
+    def _words(self, results: list[Value]) -> tuple[list[Store], list[Store]]:
+        """Return the stores that send a piece's status to the first piece, and for that the store of the worst one."""
         trace, exchange = self.trace, self.trace.exchange
         trace.graph.step = "status|s"
         finite = select(all_finite(self._inputs()), select(all_finite(results), 0.0, Status.PIVOT), Status.NOT_FINITE)
+        worst_word = []
         if exchange.is_first:
             worst: Value = 0.0
             for piece in exchange.segments:
@@ -251,8 +257,8 @@ class Step:
             word = self._verdict(worst)
             values = trace.links.lost_values()  # here, because texts of pieces of equal structure are equal
             word = select(all_finite(values), word, Status.NOT_FINITE) if values else word
-            trace.rounds = [[Store("status", (), word)]]
-        return exchange.send("S", exchange.own_segments[0], [finite])
+            worst_word.append(Store("status", (), word))
+        return exchange.send("S", exchange.own_segments[0], [finite]), worst_word
 
     def add_bodies(self) -> None:
         """Let a piece store poses_out, velocities_out = body_poses, body_velocities of its bodies after the step.
@@ -262,14 +268,14 @@ class Step:
         trace, exchange = self.trace, self.trace.exchange
         assert not exchange.alone, "by whole trees, another kernel computes the states of bodies"
         own = exchange.own_segments[0]
-        after = {(item.array, item.index[0]): item.value for item in trace.news if item.array in ("q_out", "out")}
-        trace.news = trace.news + exchange.send("X", own, map(after.__getitem__, _entries(own)))
+        after = {(item.array, item.index[0]): item.value for item in self.phases.phases.epilogue}
+        self.phases.add_final_messages(exchange.send("X", own, map(after.__getitem__, _entries(own))))
         sent: dict[tuple[str, int], Value] = {}
         for piece in exchange.segments:
             sent |= dict(zip(_entries(piece), exchange.receive("X", piece), strict=True))
         moved = trace.at({"q": lambda c: sent["q_out", c], "qd": lambda dof: sent["out", dof]})
         found = [item._replace(array="poses_out") if item.array == "out" else item for item in body_states(moved)]
-        trace.rounds = [*trace.rounds, found]
+        self.phases.add_final_stores(found)
 
     def _verdict(self, worst: Value) -> Value:
         """Return ``worst``, the most severe word of all pieces, or what the last pass adds where they are well."""
@@ -329,11 +335,11 @@ def all_finite(values: list[Value]) -> Value:
     return less(-1.0, total(v.graph.make("lost", v) for v in values if not isinstance(v, float)))
 
 
-def step(trace: Trace, qdd: bool = False, status: bool = False, bodies: bool = False) -> list[Store]:
+def step(trace: Trace, qdd: bool = False, status: bool = False, bodies: bool = False) -> StepPhases:
     """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world, with ``bodies`` poses_out
     and velocities_out."""
     one = Step(trace)
-    stores = one.stores(qdd, status)
+    found = one.stores(qdd, status)
     if bodies:
         one.add_bodies()
-    return stores
+    return found
