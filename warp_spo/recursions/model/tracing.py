@@ -43,13 +43,7 @@ class Trace:
             each couple of bodies that touches, and the entry that says so; carried: values that both sweeps use.
     """
 
-    def __init__(
-        self,
-        links: Links,
-        dtype: str,
-        inputs: tuple[str, ...],
-        exchange: Exchange | None = None,
-    ):
+    def __init__(self, links: Links, dtype: str, inputs: tuple[str, ...], exchange: Exchange | None = None):
         self.links, self.graph, self.epsilon, self.inputs = links, links.graph, EPSILON[dtype], inputs
         self.exchange = WholeTree(links) if exchange is None else exchange
         self.dampers: dict[int, Articulated] = {}
