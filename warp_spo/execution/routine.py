@@ -66,7 +66,7 @@ class TuningHints:
         waits_late: with a thread a world, where all worlds run at once, a block has two warps, and they wait for a row
             where they first use it.
         aside: at segment granularity, with many worlds and variable inertias, registers of a thread that sets aside in
-            shared memory what nothing uses for long, see :mod:`..trace.set_aside`; 0: it sets nothing aside.
+            shared memory what nothing uses for long, see :mod:`..trace.register_spilling`; 0: it sets nothing aside.
     """
 
     short: bool = False
@@ -93,7 +93,7 @@ class Routine:
         blocks: at node granularity the caller applies stored blocks instead of this routine.
         suits: ``suits(links, shapes, **options)``, whether the traced kernel serves this scene; if not, the sweeps do.
         start: ``start(trace, **options)`` returns what a search starts from; None: the kernel is no search, see
-            :mod:`.searches`.
+            :mod:`.multi_start`.
         title: ``title(inputs, **options)``, what a user calls this computation; None: the name.
         variants: at most so many different options get a kernel of their own where sweeps serve the others.
         segments: how segments share the work; None: one thread works on a whole world.
