@@ -78,7 +78,7 @@ class TuningHints:
     bias_first: Routine | None = None
     occupancy: tuple[tuple[int, int], ...] = ()
     waits_late: bool = False
-    aside: int = 0
+    registers_when_spilling: int = 0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

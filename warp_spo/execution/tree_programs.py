@@ -65,7 +65,7 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
         body = pass_loops.repeat_passes(ahead, a_pass, body, LOOPED, run.scene.dof_count, run.dtype)
     direct = layout.staged and plan.copies_directly(routine)
     late = direct and routine.hints.waits_late
-    block = PAIR * WARP_SIZE if late or (plan.few and not layout.shared_scalars) else WARP_SIZE
+    block = PAIR * WARP_SIZE if late or (plan.latency_bound and not layout.shared_scalars) else WARP_SIZE
     layout = layout._replace(retries=layout.retries and "farthest" in body, block=block, direct=direct, late=late)
     cuda = cpu = body
     if aggregates:
@@ -87,7 +87,7 @@ def _coupled_step(
     plan, T, warps = builder.plan, builder.run.dtype, min(len(couples.pairs), couple_points.MOST_WARPS)
     cpu, shared = couple_points.text(couples, parts, entries, T), sum(couple_points.arrays(couples).values())
     team = layout._replace(block=WARP_SIZE * warps, warps=warps, messages=shared, late=False)
-    helps = plan.few and plan.device.cuda and warps > 1 and not layout.result.slots
+    helps = plan.latency_bound and plan.device.cuda and warps > 1 and not layout.result.slots
     if not helps or not team.fits(T, builder.room(True)):
         return layout, cpu, cpu
     return team, couple_points.text(couples, parts, entries, T, warps), cpu

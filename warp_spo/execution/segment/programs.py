@@ -1,7 +1,7 @@
-"""Programs at segment granularity: a block computes 32 worlds, a warp one limb of each.
+"""Programs at segment granularity: a block computes 32 worlds, a warp one segment of each.
 
-Limbs of equal structure run one text, in which what differs is read from a table. Without room for what limbs tell each
-other, or with pairs of bodies that one node holds, one thread can run the work of all limbs (``alone``).
+Segments of equal structure run one text, in which what differs is read from a table. Without room for what segments
+tell each other, or with pairs of bodies that one node holds, one thread can run the work of all segments (``alone``).
 """
 
 from __future__ import annotations
@@ -18,122 +18,126 @@ from ...recursions.contact import pair_pieces
 from ...recursions.contact.couples import Team as Couplings
 from ...recursions.contact.points import own_points
 from ...recursions.contact.secant_laws import SECANT
-from ...recursions.model import messages
-from ...recursions.model import shared_constants as alike
+from ...recursions.model import messages, shared_constants
 from ...recursions.model.exchange import SegmentExchange
 from ...recursions.model.messages import INWARD, OUTWARD
-from ...recursions.model.segments import Piece, Pieces
+from ...recursions.model.segments import Segment, Segments
 from ...recursions.model.tracing import Trace
 from ...recursions.step.phases import StepPhases, as_phases
 from ...recursions.step.step import FORCE, GAIN, GUESS, MISSED, RESISTANCE
 from ...trace.emission import Emitter, Store, under
-from ...trace.register_spilling import set_aside
+from ...trace.register_spilling import spill_registers
 from ...trace.scalars import Scalar, Value, is_literal, negative, ordered
 from .. import staging
 from ..array_access import make_emitter
 from ..builder import Builder, Job, Program, flatten
 from ..device_facts import RESERVED
 from .schedule import PARTS, Schedule
-from .warp_specialized import HELD, Passes, Team, Work
+from .warp_specialized import HELD, PassLoop, SegmentCode, WarpSpecializedKernel
 
 MOST_REGISTERS = 255  # of a thread
-MOST_LAWS = 12  # dofs of unlike pieces; with more, laws are found in loops, because their statements are fetched slowly
-BODIES = "bodies"  # option of a step by limbs whose kernel writes the states of bodies, too
+MOST_LAWS = (
+    12  # dofs of unlike segments; with more, laws are found in loops, because their statements are fetched slowly
+)
+BODIES = "bodies"  # option of a step by segments whose kernel writes the states of bodies, too
 
 
-class Traced(NamedTuple):
-    """The work on one piece.
+class SegmentTrace(NamedTuple):
+    """The work on one segment.
 
     Attributes:
         phases: what its evaluation stores.
         couples, carried: of the code that couples bodies, as of a :class:`~warp_spo.recursions.model.tracing.Trace`.
-        numbers: its constants, where they may be kept from folding.
+        constants: its constants, where they may be kept from folding.
     """
 
     phases: StepPhases
     couples: list[tuple[int, list[Store]]]
-    carried: list[Value]
-    numbers: alike.Numbers | None
+    kept_between_sweeps: list[Value]
+    constants: shared_constants.SharedConstants | None
 
     @property
     def everything(self) -> list[Store]:
-        """All stores of a piece."""
+        """All stores of a segment."""
         return [*self.phases.everything, *(item for _, items in self.couples for item in items)]
 
 
-class Gathered(NamedTuple):
-    """The work of all pieces before it is one text.
+class SegmentsCode(NamedTuple):
+    """The work of all segments before it is one text.
 
     Attributes:
-        table: which value each entry of the result receives, if a table says so. sent: how many scalars pieces send.
-        looks_up: some piece reads heights. couples: the pairs of bodies. numbers: the constants of each piece.
+        table: which value each entry of the result receives, if a table says so. sent: how many scalars segments send.
+        looks_up: some segment reads heights. couples: the pairs of bodies. constants: those of each segment.
     """
 
-    team: Team
+    kernel: WarpSpecializedKernel
     layout: KernelLayout
     table: list[int] | None
     sent: int
     looks_up: bool
     couples: Couplings | None
-    numbers: list[alike.Numbers]
+    constants: list[shared_constants.SharedConstants]
 
 
-def build(builder: Builder, job: Job, pieces: Pieces, alone: bool = False, local: bool = False) -> Program | None:
-    """Return the program in which limbs share the work, None if there is no room.
+def build(builder: Builder, job: Job, segments: Segments, alone: bool = False, local: bool = False) -> Program | None:
+    """Return the program in which segments share the work, None if there is no room.
 
     Args:
         builder: the parts that all programs share.
         job: what the program computes.
-        pieces: the limbs.
+        segments: the segments.
         alone: one thread takes them all. local: it keeps what they tell each other in memory of its own.
     """
-    return _Limbs(builder, job, pieces, alone, local).build()
+    return _SegmentProgram(builder, job, segments, alone, local).build()
 
 
-class _Limbs:
-    """The work of limbs on a job; arguments as of :func:`build`."""
+class _SegmentProgram:
+    """The work of segments on a job; arguments as of :func:`build`."""
 
-    def __init__(self, builder: Builder, job: Job, pieces: Pieces, alone: bool, local: bool):
-        self.builder, self.job, self.pieces, self.alone, self.local = builder, job, pieces, alone, local
+    def __init__(self, builder: Builder, job: Job, segments: Segments, alone: bool, local: bool):
+        self.builder, self.job, self.segments, self.alone, self.local = builder, job, segments, alone, local
         self.run, self.plan, self.dtype = builder.run, builder.plan, builder.dtype
-        self.schedule = Schedule(pieces)
+        self.schedule = Schedule(segments)
         assert job.routine.segments is not None
         self.form = job.routine.segments
         self.letters = messages.needed(self.form.messages, job.shapes)
-        self.slots, self.sent = messages.slots(self.letters, pieces)
+        self.offsets, self.sent = messages.offsets(self.letters, segments)
         self.couples = self._couples() if self.form.couples_bodies else None
         self.sent = self.couples.layout["end"] if self.couples is not None else self.sent
-        self.unfolds = not self.form.couples_bodies  # constants in which limbs differ may be kept from folding
+        self.unfolds = not self.form.couples_bodies  # constants in which segments differ may be kept from folding
 
     def build(self) -> Program | None:
         """Return the program; of two, with constants that fold and with some that do not, that with fewer texts."""
-        found = self._gather([frozenset()] * len(self.pieces.pieces))
+        found = self._gather([frozenset()] * len(self.segments.all))
         if found is not None and self.unfolds:
-            apart = alike.differing(self.pieces.pieces, found.numbers, found.team.texts)
-            other = self._gather(apart) if any(apart) else None
-            if other is not None and len(set(other.team.texts)) < len(set(found.team.texts)):
+            unfolded = shared_constants.find_differing(self.segments.all, found.constants, found.kernel.texts)
+            other = self._gather(unfolded) if any(unfolded) else None
+            if other is not None and len(set(other.kernel.texts)) < len(set(found.kernel.texts)):
                 found = other
         return None if found is None else self._finish(found)
 
     def _couples(self) -> Couplings:
         """Return the pairs of bodies as a team couples them; their values follow those of messages."""
         links = self.builder.links
-        seats = pair_pieces.seats_of(links, pieces := Pieces(links))
-        alpha = -1 if seats is None or seats.base is None else self.slots["a", seats.base.index]
+        seats = pair_pieces.seats_of(links, segments := Segments(links))
+        alpha = -1 if seats is None or seats.base is None else self.offsets["a", seats.base.index]
         warps = [assigned.warp for assigned in self.schedule.assignments]
-        return pair_pieces.team(links, pieces, alpha, self.sent, warps)
+        return pair_pieces.team(links, segments, alpha, self.sent, warps)
 
-    # -- the work of each piece ------------------------------------------------------------------------------------
-    def _trace(self, index: int, unfolded: frozenset) -> Traced:
-        """Return what the work on a piece stores; the constants ``unfolded`` do not fold, see :mod:`.alike`."""
+    # -- the work of each segment ------------------------------------------------------------------------------------
+    def _trace(self, index: int, unfolded: frozenset) -> SegmentTrace:
+        """Return what the work on a segment stores; the constants ``unfolded`` do not fold, see
+        :mod:`.shared_constants`."""
         shapes, options = self.job.shapes, self.job.options
-        links = self.builder.own_links(options, self.unfolds)  # its own: pieces of equal structure then give equal text
-        exchange = SegmentExchange(links, index, self.slots, self.pieces.unlike > MOST_LAWS)
+        links = self.builder.own_links(
+            options, self.unfolds
+        )  # its own: segments of equal structure then give equal text
+        exchange = SegmentExchange(links, index, self.offsets, self.segments.distinct_dof_count > MOST_LAWS)
         trace = Trace(links, self.dtype, tuple(shapes), exchange)
         trace.team = self.couples
         if self.unfolds:
             points = [number for number, _ in own_points(trace)]
-            links.numbers = alike.Numbers(links.graph, exchange.segment, points, unfolded)
+            links.shared_constants = shared_constants.SharedConstants(links.graph, exchange.segment, points, unfolded)
 
         def flat(items: list[Store]) -> list[Store]:
             return [flatten(item, shapes) for item in items]
@@ -145,15 +149,17 @@ class _Limbs:
             final_messages=flat(phases.final_messages),
             final_stores=[flat(group) for group in phases.final_stores],
         )
-        found = Traced(phases, trace.couples, trace.carried, links.numbers if self.unfolds else None)
+        found = SegmentTrace(
+            phases, trace.couples, trace.kept_between_sweeps, links.shared_constants if self.unfolds else None
+        )
         used = _read(phases.pass_invariants, found.everything[len(phases.prologue) :])
         return found._replace(phases=phases._replace(pass_invariants=used))
 
-    def _gather(self, unfolded: list[frozenset]) -> Gathered | None:
-        """Return the work of all pieces, None if there is no room; ``unfolded``: by piece, see :meth:`_trace`."""
-        job, pieces, schedule = self.job, self.pieces, self.schedule
+    def _gather(self, unfolded: list[frozenset]) -> SegmentsCode | None:
+        """Return the work of all segments, None if there is no room; ``unfolded``: by segment, see :meth:`_trace`."""
+        job, segments, schedule = self.job, self.segments, self.schedule
         routine = job.routine
-        traced = [self._trace(index, unfolded[index]) for index in range(len(pieces.pieces))]
+        traced = [self._trace(index, unfolded[index]) for index in range(len(segments.all))]
         everything = [item for one in traced for item in one.everything]
         bends = any(item.array == MISSED for item in everything)
         if not (bends or routine.is_counted):
@@ -166,31 +172,31 @@ class _Limbs:
         if not self._fits(layout):
             return None
         declared = "" if self.couples is None else coupling_teams.declare(self.couples, self.run.dtype, self.local)
-        team = Team(schedule, self.dtype, passes, declared)
+        kernel = WarpSpecializedKernel(schedule, self.dtype, passes, declared)
         outs = [[item for item in one.phases.sweep if item.array == "out"] for one in traced]
         placed, table = staging.arrange_stores(whole, layout.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
         looks_up = False
-        for piece, one, items in zip(pieces.pieces, traced, outs, strict=True):
-            looks_up |= self._add_work(team, layout, table, piece, one, items)
-        numbers = [one.numbers for one in traced if one.numbers is not None]
-        return Gathered(team, layout, table, sent, looks_up, self.couples, numbers)
+        for segment, one, items in zip(segments.all, traced, outs, strict=True):
+            looks_up |= self._add_work(kernel, layout, table, segment, one, items)
+        constants = [one.constants for one in traced if one.constants is not None]
+        return SegmentsCode(kernel, layout, table, sent, looks_up, self.couples, constants)
 
-    def _passes(self, traced: list[Traced], bends: bool) -> Passes | None:
+    def _passes(self, traced: list[SegmentTrace], bends: bool) -> PassLoop | None:
         """Return how the work is repeated; ``bends``: guesses of a pass may turn out wrong."""
         sizes = {index: len(one.phases.pass_invariants) for index, one in enumerate(traced)}
         if self.job.routine.is_counted:
             counts = [sum(item.array == SECANT for item in one.phases.prologue) for one in traced]
-            return Passes((GAIN,), None, sizes, dict(enumerate(counts)))
+            return PassLoop((GAIN,), None, sizes, dict(enumerate(counts)))
         if self.job.routine.passes is None:
             return None
         kept = (GUESS, GAIN, FORCE, RESISTANCE) if any(one.phases.laws for one in traced) else (GUESS, GAIN)
-        return Passes(kept, self.sent if bends else None, sizes)
+        return PassLoop(kept, self.sent if bends else None, sizes)
 
     def _fits(self, layout: KernelLayout) -> bool:
-        """Whether shared memory has room for the result, for messages of limbs, and for the states of bodies.
+        """Whether shared memory has room for the result, for messages of segments, and for the states of bodies.
 
-        The result without room matters more than a thread a limb; another kernel then writes the states of bodies.
+        The result without room matters more than a thread a segment; another kernel then writes the states of bodies.
         """
         form, options = self.form, self.job.options
         if layout.result.way == DIRECT and layout.result.array.entries > staging.LONG_ROW:
@@ -200,9 +206,15 @@ class _Limbs:
         return not options.get(BODIES) or bool(layout.further_staged)
 
     def _add_work(
-        self, team: Team, layout: KernelLayout, table: list[int] | None, piece: Piece, one: Traced, outs: list[Store]
+        self,
+        kernel: WarpSpecializedKernel,
+        layout: KernelLayout,
+        table: list[int] | None,
+        segment: Segment,
+        one: SegmentTrace,
+        outs: list[Store],
     ) -> bool:
-        """Add the statements of a piece to the team, ``outs`` of its stores; return whether it reads heights."""
+        """Add the statements of a segment to the kernel, ``outs`` of its stores; return whether it reads heights."""
         routine, shapes, more, _ = self.job
         phases, held = one.phases, one.phases.pass_invariants
 
@@ -213,58 +225,69 @@ class _Limbs:
             return found if table is None else staging.stores_by_slot(found, table)
 
         first, sweeps, ruling, checking = (emitter() for _ in range(4))
-        later = emitter() if team.passes else sweeps
-        ahead = first.region([*phases.prologue, *(Store(HELD, (at,), value) for at, value in enumerate(held))])
+        later = emitter() if kernel.passes else sweeps
+        pass_invariants = first.region(
+            [*phases.prologue, *(Store(HELD, (at,), value) for at, value in enumerate(held))]
+        )
         sweeps.keep(HELD, held)
         if routine.is_counted:
-            later.keep(HELD, held)  # other pieces may have written over what these come from
+            later.keep(HELD, held)  # other segments may have written over what these come from
         inward = [item for item in phases.sweep if item.array == INWARD]
         outward = [item for item in phases.sweep if item.array == OUTWARD]
         last = outward if set(self.letters) & set(messages.OUTWARD_LETTERS) else inward
         last += by_slot(outs)
         last += [item for item in phases.sweep if item.array in (*more, GAIN, SECANT)]
-        sweep = sweeps.region(inward, one.carried)
+        sweep = sweeps.region(inward, one.kept_between_sweeps)
         couples = [under(sweeps.branch(items), "SENT({}) > 0", INWARD, flag) for flag, items in one.couples]
         back = sweeps.region(outward)
         after = [*phases.epilogue, *phases.final_messages]
         ends = [item for item in after if item.array == "out"]
-        news = later.branch([item for item in after if item.array != "out"] + by_slot(ends))
-        rounds = [later.branch(by_slot(group)) for group in phases.final_stores]
+        final_messages = later.branch([item for item in after if item.array != "out"] + by_slot(ends))
+        final_stores = [later.branch(by_slot(group)) for group in phases.final_stores]
         laws, checks = ([each.branch(group) for group in groups]
                         for each, groups in ((ruling, phases.laws), (checking, phases.checks)))  # fmt: skip
         emitters = {first, sweeps, later, ruling, checking}
-        work = Work(
-            piece, self.schedule.assignments[piece.index], sweep, back, laws, checks, news, rounds, ahead, couples
+        work = SegmentCode(
+            segment,
+            self.schedule.assignments[segment.index],
+            sweep,
+            back,
+            laws,
+            checks,
+            final_messages,
+            final_stores,
+            pass_invariants,
+            couples,
         )
-        team.add(work, sum(each.operations for each in emitters))
+        kernel.add(work, sum(each.operations for each in emitters))
         return any(each.counts["lookup"] for each in emitters)
 
     # -- from the work to a kernel ---------------------------------------------------------------------------------
-    def _finish(self, found: Gathered) -> Program:
+    def _finish(self, found: SegmentsCode) -> Program:
         """Return the program of gathered work."""
-        team, layout, table, sent, looks_up, couples, _ = found
+        kernel, layout, table, sent, looks_up, couples, _ = found
         routine, T = self.job.routine, self.run.dtype
-        cpu = team.cpu()
+        cpu = kernel.cpu()
         if self.local:
             cpu = f"{C_TYPE[T]} sent[{sent}];\n#undef SENT\n#define SENT(i) sent[i]\n{cpu}"
-        cuda = cpu if self.alone else team.cuda()  # fills the tables
+        cuda = cpu if self.alone else kernel.cuda()  # fills the tables
         registers = self._registers(layout)
-        if places := self.plan.places_aside(
+        if places := self.plan.spill_slots(
             routine, layout.shared_bytes(T), wp.types.type_size_in_bytes(T), layout.warps
         ):
-            layout, registers = layout._replace(aside=places), routine.hints.aside
-            cuda = set_aside(cuda, C_TYPE[T], places)
-        lists = {"place": table, "table": team.shared.table, "shifts": team.shared.shifts}
+            layout, registers = layout._replace(spill_slots=places), routine.hints.aside
+            cuda = spill_registers(cuda, C_TYPE[T], places)
+        lists = {"place": table, "table": kernel.shared.table, "shifts": kernel.shared.shifts}
         tables = {name: values for name, values in lists.items() if values} | self.builder.height_tables(looks_up)
         if couples is not None:
             tables |= self.builder.touch_tables(couples.points)
         cap = registers if registers < MOST_REGISTERS else None
-        return self.builder.finish(routine, layout, cuda, cpu, tables, team.shared.operations, cap)
+        return self.builder.finish(routine, layout, cuda, cpu, tables, kernel.shared.operations, cap)
 
     def _registers(self, layout: KernelLayout) -> int:
         """Return how many registers a thread may take, so that a multiprocessor holds as many blocks as help."""
         warps = 1 if self.alone else self.schedule.warps
-        if self.dtype == "float32" and not self.plan.few:
+        if self.dtype == "float32" and not self.plan.latency_bound:
             for blocks, enough in self.job.routine.hints.occupancy:
                 fewer = self._shared_registers(blocks * self.schedule.warps)
                 room = blocks * (layout.shared_bytes(self.run.dtype) + RESERVED) <= self.plan.device.shared_bytes

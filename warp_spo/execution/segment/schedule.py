@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from ...recursions.model.segments import Piece, Pieces
+from ...recursions.model.segments import Segment, Segments
 from ...trace.scalars import is_constant
 
 PARTS = 4  # of a multiprocessor, which divide its warps among them
@@ -38,68 +38,70 @@ class Schedule:
         warps: number of warps that work on a world. stages: number of stages, with a barrier between any two.
     """
 
-    def __init__(self, segments: Pieces):
+    def __init__(self, segments: Segments):
         self.segments = segments
         leaves = segments.leaves[::-1]
         self.warps = len(leaves)
-        self._warp = {piece.index: warp for warp, piece in zip(_warps_of_leaves(leaves), leaves, strict=True)}
-        self._inward = {piece.index: 0 for piece in leaves}
-        for piece in reversed(segments.pieces):
-            if piece.children:
-                self._hand_over(piece)
+        self._warp = {segment.index: warp for warp, segment in zip(_warps_of_leaves(leaves), leaves, strict=True)}
+        self._inward = {segment.index: 0 for segment in leaves}
+        for segment in reversed(segments.segments):
+            if segment.children:
+                self._hand_over(segment)
         outward = self._outward_stages()
         self.stages = max(outward) + 1
         self.assignments = [
-            Assignment(self._warp[piece.index], self._inward[piece.index], outward[piece.index])
-            for piece in segments.pieces
+            Assignment(self._warp[segment.index], self._inward[segment.index], outward[segment.index])
+            for segment in segments.segments
         ]
 
-    def _hand_over(self, piece: Piece) -> None:
+    def _hand_over(self, segment: Segment) -> None:
         """Give an inner segment to the warp of the child that is done last; of several, to the warp with least work.
 
         Work is compared by the part of a multiprocessor first, because each part issues instructions for its own warps.
         """
         warp, inward = self._warp, self._inward
-        last = max(inward[child.index] for child in piece.children)
-        awaited = [child for child in piece.children if inward[child.index] == last]
+        last = max(inward[child.index] for child in segment.children)
+        awaited = [child for child in segment.children if inward[child.index] == last]
         if len(awaited) == 1:
-            warp[piece.index] = warp[awaited[0].index]
+            warp[segment.index] = warp[awaited[0].index]
         else:
             load = [0] * self.warps
-            for other in self.segments.pieces:
-                if other.index > piece.index or not other.children:
+            for other in self.segments.segments:
+                if other.index > segment.index or not other.children:
                     load[warp[other.index]] += other.weight
-            below = {warp[leaf.index] for leaf in self.segments.leaves if piece.root is leaf.root}
-            warp[piece.index] = min(below, key=lambda one: (sum(load[one % PARTS :: PARTS]), load[one], -one))
-        inward[piece.index] = max(
-            inward[child.index] + (warp[child.index] != warp[piece.index]) for child in piece.children
+            below = {warp[leaf.index] for leaf in self.segments.leaves if segment.root is leaf.root}
+            warp[segment.index] = min(below, key=lambda one: (sum(load[one % PARTS :: PARTS]), load[one], -one))
+        inward[segment.index] = max(
+            inward[child.index] + (warp[child.index] != warp[segment.index]) for child in segment.children
         )
 
     def _outward_stages(self) -> list[int]:
         """Return the stage of each outward sweep; all leaves have the last one, because equal ones share their code."""
         stages: list[int] = []
-        for piece in self.segments.pieces:
-            above = piece.parent
-            start = 0 if above is None else stages[above.index] + (self._warp[piece.index] != self._warp[above.index])
-            stages.append(max(start, self._inward[piece.index]))
+        for segment in self.segments.segments:
+            above = segment.parent
+            start = 0 if above is None else stages[above.index] + (self._warp[segment.index] != self._warp[above.index])
+            stages.append(max(start, self._inward[segment.index]))
         last = max(stages)
-        return [stage if piece.children else last for piece, stage in zip(self.segments.pieces, stages, strict=True)]
+        return [
+            stage if segment.children else last for segment, stage in zip(self.segments.segments, stages, strict=True)
+        ]
 
 
-def _warps_of_leaves(leaves: list[Piece]) -> list[int]:
+def _warps_of_leaves(leaves: list[Segment]) -> list[int]:
     """Return the warp of each leaf: leaves of one kind share a part of the multiprocessor, which fetches its own code.
 
     Warp w runs on part w % PARTS. Up to PARTS leaves have a part each, in their order.
     """
-    kinds = [_kind(piece) for piece in leaves]
+    kinds = [_kind(segment) for segment in leaves]
     grouped = sorted(range(len(leaves)), key=lambda at: (-kinds.count(kinds[at]), kinds.index(kinds[at])))
     places = sorted(range(len(leaves)), key=lambda warp: (warp % PARTS, warp))
     warps = dict(zip(grouped, places, strict=True)) if len(leaves) > PARTS else dict(enumerate(range(len(leaves))))
     return [warps[at] for at in range(len(leaves))]
 
 
-def _kind(piece: Piece) -> tuple:
+def _kind(segment: Segment) -> tuple:
     """Return what is equal for segments that share code: hinges, and which entries of rotations are 0, 1 or -1."""
-    entries = [[x for row in link.matrix or () for x in row] for link in piece.links]
+    entries = [[x for row in link.matrix or () for x in row] for link in segment.links]
     folded = [tuple(x if is_constant(x) and x in (0.0, 1.0, -1.0) else None for x in each) for each in entries]
-    return tuple(zip((link.hinge.shape for link in piece.links), folded, strict=True))
+    return tuple(zip((link.hinge.shape for link in segment.links), folded, strict=True))

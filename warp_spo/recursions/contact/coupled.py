@@ -19,9 +19,9 @@ from ..step.phases import StepPhases
 from . import aggregates
 from .aggregates import LAST, Node, Seat, Seats, Tie, add
 from .pairs import RESIDUAL, place_axes_of, values_of, velocities_of
-from .points import Point, with_ancestors
-from .step import ContactStep, Touch
-from .ties import Couple, Plan, couples_of, flies, key
+from .points import TracedContactPoint, with_ancestors
+from .step import ContactStepTrace, PointState
+from .ties import Couple, TiePlan, couples_of, flies, key
 
 if TYPE_CHECKING:
     pass
@@ -40,14 +40,14 @@ MOST_WORK = 15_000  # products of an elimination, whose code has no loops; 8 pai
 
 def suits(links: Links) -> bool:
     """Whether aggregates couple the pairs of a scene: links share no dofs, all pairs move, code is not too long."""
-    pairs = ((links.seats[body].link if body >= 0 else None for body in (p.body, p.other))
+    pairs = ((links.placements[body].link if body >= 0 else None for body in (p.body, p.other))
              for p in links.scene.contact_pairs)  # fmt: skip
-    if any(link.group is not None for link in links.links) or not all(map(any, pairs)):
+    if any(link.shared_dofs is not None for link in links.links) or not all(map(any, pairs)):
         return False
-    return Plan(links, couples_of(links)).work <= MOST_WORK
+    return TiePlan(links, couples_of(links)).work <= MOST_WORK
 
 
-class CoupledStep(ContactStep):
+class CoupledStep(ContactStepTrace):
     """One time step with contacts of bodies with each other, too, as a trace; arguments as those of ContactStep."""
 
     def stores(self, qdd: bool, status: bool) -> StepPhases:
@@ -70,10 +70,10 @@ class CoupledStep(ContactStep):
         """Return the stores of qdd; ``alpha`` receives the accelerations of links by id."""
         return aggregates.expand(self.trace, self.plan, self.nodes, done, rates, alpha)
 
-    def _press(self, points: list[Point], touches: list[Touch]) -> None:
-        super()._press(points, touches)
+    def _press(self, points: list[TracedContactPoint], states: list[PointState]) -> None:
+        super()._press(points, states)
         trace = self.trace
-        self.plan = Plan(trace.links, couples_of(trace.links), lambda link: flies(self._with_resistance(link)))
+        self.plan = TiePlan(trace.links, couples_of(trace.links), lambda link: flies(self._with_resistance(link)))
         self.couples = self.plan.couples
         passes = trace.graph.input("passes", 0)  # native code counts them, too
         self.first += [Store(VALUE, (i,), value) for i, value in enumerate([*values_of(self), passes])]
@@ -100,8 +100,8 @@ class CoupledStep(ContactStep):
             if couple.ties:
                 ties[number] = Tie(K, load, self._columns(number, couple))
             elif couple.g is None:
-                add(trace.dampers, id(couple.f), K)
-                add(trace.pushes, id(couple.f), load)
+                add(trace.contact_inertia, id(couple.f), K)
+                add(trace.contact_force, id(couple.f), load)
         self.nodes: dict[int, Node] = {}
         for aggregate in self.plan.aggregates:
             mask = total(trace.graph.input(COUPLED, number) for number in aggregate.couples)
@@ -175,7 +175,7 @@ class CoupledStep(ContactStep):
         for pair in couple.pairs:
             row = links.scene.contact_pairs[pair]
             for side, (body, shape) in enumerate(zip((row.body, row.other), row.shapes, strict=True)):
-                own = links.seat(body, shape.pose)
+                own = links.placement(body, shape.pose)
                 seat = self._seat(number, couple, own.link)
                 at, turn = seat.at + seat.turn @ own.offset, seat.turn @ own.matrix
                 values = [*at, *(x for axis in turn for x in axis)]

@@ -17,7 +17,7 @@ from ...trace.scalars import Value
 from ...trace.spatial import Articulated, Vector
 from . import messages
 from .links import Link, Links
-from .segments import Piece, Pieces
+from .segments import Segment, Segments
 
 
 class Exchange(abc.ABC):
@@ -38,20 +38,20 @@ class Exchange(abc.ABC):
     shares_code: bool
     is_first: bool
     laws_in_loops: bool
-    parent: Piece | None
-    children: tuple[Piece, ...]
+    parent: Segment | None
+    children: tuple[Segment, ...]
 
     def __init__(self, links: Links):
         self.links = links
 
     @functools.cached_property
-    def segments(self) -> list[Piece]:
+    def segments(self) -> list[Segment]:
         """All segments of the scene, parents first."""
-        return Pieces(self.links).pieces
+        return Segments(self.links).pieces
 
     @property
     @abc.abstractmethod
-    def own_segments(self) -> list[Piece]:
+    def own_segments(self) -> list[Segment]:
         """The segments that this evaluation works on."""
 
     @abc.abstractmethod
@@ -67,11 +67,11 @@ class Exchange(abc.ABC):
         """Return the place of a dof among those of this evaluation."""
 
     @abc.abstractmethod
-    def send(self, letter: str, segment: Piece, values: Iterable[Value]) -> list[Store]:
+    def send(self, letter: str, segment: Segment, values: Iterable[Value]) -> list[Store]:
         """Return the stores that send a message of a segment."""
 
     @abc.abstractmethod
-    def receive(self, letter: str, segment: Piece) -> list[Value]:
+    def receive(self, letter: str, segment: Segment) -> list[Value]:
         """Return the message that a segment sends."""
 
     @abc.abstractmethod
@@ -104,10 +104,10 @@ class WholeTree(Exchange):
 
     def __init__(self, links: Links):
         super().__init__(links)
-        self._kept: dict[tuple[str, int], list[Value]] = {}
+        self._pass_index: dict[tuple[str, int], list[Value]] = {}
 
     @property
-    def own_segments(self) -> list[Piece]:
+    def own_segments(self) -> list[Segment]:
         return self.segments
 
     def own(self, link: Link | None) -> bool:
@@ -119,12 +119,12 @@ class WholeTree(Exchange):
     def place_of(self, dof: int) -> int:
         return dof
 
-    def send(self, letter: str, segment: Piece, values: Iterable[Value]) -> list[Store]:
-        self._kept[letter, segment.index] = list(values)
+    def send(self, letter: str, segment: Segment, values: Iterable[Value]) -> list[Store]:
+        self._pass_index[letter, segment.index] = list(values)
         return []
 
-    def receive(self, letter: str, segment: Piece) -> list[Value]:
-        return self._kept[letter, segment.index]
+    def receive(self, letter: str, segment: Segment) -> list[Value]:
+        return self._pass_index[letter, segment.index]
 
     def from_children(self, link: Link, letter: str, known: dict[int, Any], build: Callable[[list], Any]) -> list[Any]:
         return [known[id(child)] for child in link.children]
@@ -164,7 +164,7 @@ class SegmentExchange(Exchange):
         self._places = {dof: at for at, dof in enumerate(self.segment.dofs)}
 
     @property
-    def own_segments(self) -> list[Piece]:
+    def own_segments(self) -> list[Segment]:
         return [self.segment]
 
     def own(self, link: Link | None) -> bool:
@@ -176,11 +176,11 @@ class SegmentExchange(Exchange):
     def place_of(self, dof: int) -> int:
         return self._places[dof]
 
-    def send(self, letter: str, segment: Piece, values: Iterable[Value]) -> list[Store]:
+    def send(self, letter: str, segment: Segment, values: Iterable[Value]) -> list[Store]:
         first = self.offsets[letter, segment.index]
         return [Store(messages.way(letter), (first + i,), value) for i, value in enumerate(values)]
 
-    def receive(self, letter: str, segment: Piece) -> list[Value]:
+    def receive(self, letter: str, segment: Segment) -> list[Value]:
         first, size = self.offsets[letter, segment.index], messages.size(letter, segment)
         return [self.links.graph.input(messages.way(letter), first + i) for i in range(size)]
 

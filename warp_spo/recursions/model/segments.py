@@ -11,19 +11,19 @@ from .links import Link, Links
 
 
 @dataclasses.dataclass(eq=False)
-class Piece:
+class Segment:
     """A serial chain of links.
 
     Attributes:
-        index: its place in :attr:`Pieces.pieces`.
+        index: its place in :attr:`Segments.all`.
         links: from the innermost out.
-        parent, children: the pieces that it moves on and that move on it.
+        parent, children: the segments that it moves on and that move on it.
     """
 
     index: int
     links: list[Link]
-    parent: Piece | None
-    children: list[Piece] = dataclasses.field(default_factory=list)
+    parent: Segment | None
+    children: list[Segment] = dataclasses.field(default_factory=list)
 
     @property
     def dofs(self) -> list[int]:
@@ -31,17 +31,17 @@ class Piece:
         return [dof for link in self.links for dof in link.dofs]
 
     @property
-    def weight(self) -> int:
+    def dof_count(self) -> int:
         return len(self.dofs)
 
     @property
-    def coordinates(self) -> int:
+    def coord_count(self) -> int:
         """Number of entries of q of its links."""
         return sum(link.hinge.coordinates for link in self.links)
 
     @property
-    def ancestors(self) -> list[Piece]:
-        """The pieces that it moves on, its parent first."""
+    def ancestors(self) -> list[Segment]:
+        """The segments that it moves on, its parent first."""
         return [] if self.parent is None else [self.parent, *self.parent.ancestors]
 
     @property
@@ -51,25 +51,25 @@ class Piece:
     @property
     def all_dofs(self) -> list[int]:
         """The dofs that move its last link, from the root out."""
-        return [dof for piece in reversed([self, *self.ancestors]) for dof in piece.dofs]
+        return [dof for segment in reversed([self, *self.ancestors]) for dof in segment.dofs]
 
     @property
-    def root(self) -> Piece:
-        """The first piece of its tree."""
+    def root(self) -> Segment:
+        """The first segment of its tree."""
         return self.ancestors[-1] if self.ancestors else self
 
-    def fork(self, other: Piece) -> Piece | None:
-        """Return the last piece that carries both, or None."""
+    def common_ancestor(self, other: Segment) -> Segment | None:
+        """Return the last segment that carries both, or None."""
         mine = [self, *self.ancestors]
-        return next((piece for piece in (other, *other.ancestors) if piece in mine), None)
+        return next((segment for segment in (other, *other.ancestors) if segment in mine), None)
 
-    def looks_at(self, other: Piece) -> bool:
-        """Return whether this piece, not ``other``, computes the entries that two branches share.
+    def computes_shared_entries_with(self, other: Segment) -> bool:
+        """Return whether this segment, not ``other``, computes the entries that two branches share.
 
         A leaf computes them; between two leaves the one with fewer dofs; between equals the two alternate.
         """
-        fork = self.fork(other)
-        if fork is None or fork in (self, other):
+        common_ancestor = self.common_ancestor(other)
+        if common_ancestor is None or common_ancestor in (self, other):
             return False
         if self._burden != other._burden:
             return self._burden < other._burden
@@ -80,45 +80,48 @@ class Piece:
         return bool(self.children), len(self.all_dofs)
 
 
-class Pieces:
-    """All pieces of a scene, parents first."""
+class Segments:
+    """All segments of a scene, parents first."""
 
     def __init__(self, links: Links):
-        self.pieces: list[Piece] = []
-        self.of: dict[int, Piece] = {}  # by id of the link
+        self.all: list[Segment] = []
+        self.by_link: dict[int, Segment] = {}  # by id of the link
         for link in links.links:
-            above = None if link.parent is None else self.of[id(link.parent)]
+            above = None if link.parent is None else self.by_link[id(link.parent)]
             if above is not None and len(link.parent.children) == 1:  # type: ignore[union-attr]
-                piece = above
+                segment = above
             else:
-                piece = Piece(len(self.pieces), [], above)
-                self.pieces.append(piece)
+                segment = Segment(len(self.all), [], above)
+                self.all.append(segment)
                 if above is not None:
-                    above.children.append(piece)
-            piece.links.append(link)
-            self.of[id(link)] = piece
+                    above.children.append(segment)
+            segment.links.append(link)
+            self.by_link[id(link)] = segment
 
     @property
-    def leaves(self) -> list[Piece]:
-        """The pieces that carry no other."""
-        return [piece for piece in self.pieces if not piece.children]
+    def leaves(self) -> list[Segment]:
+        """The segments that carry no other."""
+        return [segment for segment in self.all if not segment.children]
 
     @property
-    def unlike(self) -> int:
-        """Number of dofs in pieces that are not alike, one of each kind counted; free hinges are left out."""
-        kinds = {tuple(link.hinge.name for link in piece.links): piece for piece in self.pieces}
-        return sum(len(link.dofs) for piece in kinds.values() for link in piece.links if not link.hinge.unconstrained)
+    def distinct_dof_count(self) -> int:
+        """Number of dofs in segments that are not alike, one of each kind counted; free hinges are left out."""
+        kinds = {tuple(link.hinge.name for link in segment.links): segment for segment in self.all}
+        return sum(
+            len(link.dofs) for segment in kinds.values() for link in segment.links if not link.hinge.unconstrained
+        )
 
     @property
-    def alike(self) -> float:
-        """Share of the limbs' dofs that is in limbs of which there is another with the same hinges: they share code."""
-        limbs = self.leaves
-        kinds = [tuple(link.hinge.shape for link in piece.links) for piece in limbs]
-        twice = sum(piece.weight for piece, kind in zip(limbs, kinds, strict=True) if kinds.count(kind) > 1)
-        return twice / sum(piece.weight for piece in limbs)
+    def shared_code_fraction(self) -> float:
+        """Share of the segments' dofs that is in segments of which there is another with the same hinges: they share
+        code."""
+        segments = self.leaves
+        kinds = [tuple(link.hinge.shape for link in segment.links) for segment in segments]
+        twice = sum(segment.dof_count for segment, kind in zip(segments, kinds, strict=True) if kinds.count(kind) > 1)
+        return twice / sum(segment.dof_count for segment in segments)
 
     @property
-    def serial(self) -> float:
-        """Largest share of the links that is on one path from a root to a leaf: the time that limbs cannot save."""
-        paths = [sum(len(each.links) for each in (piece, *piece.ancestors)) for piece in self.pieces]
-        return max(paths) / sum(len(piece.links) for piece in self.pieces)
+    def longest_path_fraction(self) -> float:
+        """Largest share of the links that is on one path from a root to a leaf: the time that segments cannot save."""
+        paths = [sum(len(each.links) for each in (segment, *segment.ancestors)) for segment in self.all]
+        return max(paths) / sum(len(segment.links) for segment in self.all)

@@ -14,16 +14,16 @@ from ...trace.emission import Store
 from ...trace.scalars import Value
 from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Vector, cross
 from .. import motion, newton_euler
-from ..motion import STILL, Motion
+from ..motion import STILL, VelocityTerms
 from .exchange import Exchange, WholeTree
-from .links import Link, Links, Placed, place_link
-from .segments import Piece
+from .links import Link, LinkPlacement, Links, place_link
+from .segments import Segment
 
 EPSILON = {"float32": 2.0**-23, "float64": 2.0**-52}
 
 
 class Trace:
-    """One evaluation of a scene, or of one piece of it: what is shared between the recursions on it.
+    """One evaluation of a scene, or of one segment of it: what is shared between the recursions on it.
 
     Args:
         links: the scene's links.
@@ -34,31 +34,32 @@ class Trace:
 
     Attributes:
         places: by id of the link: its placement. motions: its velocity terms. axes: its axes in the inertial frame.
-        compensates: external wrenches hold up the bodies' ``gravcomp``, as forces of the hinges do.
-        stiffened: returns a link with what a time step adds to its armature.
-        dampers, pushes: by id of the link: what contacts add to its articulated inertia, and to the forces on it; of a
-            piece also for the link that it moves on.
-        instead: entries that take the place of those of an array, by its name.
-        team: of a piece, the pairs of bodies that native code couples between its sweeps. couples: what it stores for
-            each couple of bodies that touches, and the entry that says so; carried: values that both sweeps use.
+        compensates_gravity: external wrenches hold up the bodies' ``gravcomp``, as forces of the hinges do.
+        with_step_armature: returns a link with what a time step adds to its armature.
+        contact_inertia, contact_force: by id of the link: what contacts add to its articulated inertia, and to the
+            forces on it; of a segment also for the link that it moves on.
+        substitutes: entries that take the place of those of an array, by its name.
+        team: of a segment, the pairs of bodies that native code couples between its sweeps. couples: what it stores for
+            each couple of bodies that touches, and the entry that says so; kept_between_sweeps: values that both sweeps
+            use.
     """
 
     def __init__(self, links: Links, dtype: str, inputs: tuple[str, ...], exchange: Exchange | None = None):
         self.links, self.graph, self.epsilon, self.inputs = links, links.graph, EPSILON[dtype], inputs
         self.exchange = WholeTree(links) if exchange is None else exchange
-        self.dampers: dict[int, Articulated] = {}
-        self.pushes: dict[int, Vector] = {}
-        self.instead: dict[str, Callable[[int], Value]] = {}
+        self.contact_inertia: dict[int, Articulated] = {}
+        self.contact_force: dict[int, Vector] = {}
+        self.substitutes: dict[str, Callable[[int], Value]] = {}
         self.team: Any = None
         self.couples: list[tuple[int, list[Store]]] = []
-        self.carried: list[Value] = []
-        self.places: dict[int, Placed] = {}
-        self.motions: dict[int, Motion] = {}
+        self.kept_between_sweeps: list[Value] = []
+        self.places: dict[int, LinkPlacement] = {}
+        self.motions: dict[int, VelocityTerms] = {}
         self.axes: dict[int, Matrix] = {}
-        self.compensates = False
-        self.stiffened: Callable[[Link], Link] = lambda link: link
+        self.compensates_gravity = False
+        self.with_step_armature: Callable[[Link], Link] = lambda link: link
         self.bodies: dict[int, list[int]] = {}  # by link: the bodies whose centre of mass is on it
-        for body in links.seats:
+        for body in links.placements:
             link = links.carrier(body)
             if link is not None:
                 self.bodies.setdefault(id(link), []).append(body)
@@ -66,8 +67,8 @@ class Trace:
     # -- inputs ----------------------------------------------------------------------------------------------------
     def vector(self, name: str) -> Callable[[int], Value]:
         """Return ``entry(i)`` of an array; zero if the array is not among the inputs."""
-        if name in self.instead:
-            return self.instead[name]
+        if name in self.substitutes:
+            return self.substitutes[name]
         if name not in self.inputs:
             return lambda i: 0.0
         return lambda i: self.graph.input(name, i)
@@ -75,7 +76,7 @@ class Trace:
     def at(self, state: Mapping[str, Callable[[int], Value]]) -> Trace:
         """Return a trace of the same links at another ``state``: functions of entries of "q" and "qd", no forces."""
         other = copy.copy(self)
-        other.inputs, other.instead, other.compensates = tuple(state), dict(state), False
+        other.inputs, other.substitutes, other.compensates_gravity = tuple(state), dict(state), False
         other.places, other.motions, other.axes = {}, {}, {}
         return other
 
@@ -91,21 +92,21 @@ class Trace:
         parent = None if link.parent is None else self.motions[id(link.parent)]
         qd = self.vector("qd") if moves else None
         self.motions[id(link)] = motion.link_motion(link, place, parent, qd) if moves else STILL
-        if "body_f" in self.inputs or self.compensates:
+        if "body_f" in self.inputs or self.compensates_gravity:
             R = IDENTITY if link.parent is None else self.axes[id(link.parent)]
             self.axes[id(link)] = R @ place.pose.rotation
 
     def compensate_gravity(self) -> bool:
         """Let external wrenches hold up the bodies' ``gravcomp`` from now on; return whether a body has any."""
-        self.compensates = any(link.lift is not None for link in self.links.links)
-        return self.compensates
+        self.compensates_gravity = any(link.gravity_compensation is not None for link in self.links.links)
+        return self.compensates_gravity
 
     def external_wrench(self, link: Link) -> Vector:
         """Return (n; f) of the external wrenches on the bodies of a link, in its frame."""
         n, f = ZERO, ZERO
-        if self.compensates and link.lift is not None:
+        if self.compensates_gravity and link.gravity_compensation is not None:
             up = -(self.axes[id(link)].T @ self.links.gravity)
-            n, f = cross(link.lift.moment, up), up * link.lift.mass
+            n, f = cross(link.gravity_compensation.moment, up), up * link.gravity_compensation.mass
         if "body_f" not in self.inputs:
             return Vector((*n, *f))
         acting = []
@@ -117,44 +118,46 @@ class Trace:
         return Vector((*n, *f))
 
     def _center(self, body: int) -> Vector:
-        """Return the centre of mass of a body of this piece in its link, with numbers that may be kept from folding."""
-        numbers, seat = self.links.numbers, self.links.seats[body]
-        if numbers is None or body in self.links.flexible:
+        """Return the centre of mass of a body of this segment in its link, with numbers that may be kept from
+        folding."""
+        constants, placement = self.links.shared_constants, self.links.placements[body]
+        if constants is None or body in self.links.flexible:
             return self.links.center(body)[1]
         at, com = self.own_bodies.index(body), self.links.nodes[body].com
-        rows = numbers.of_body(at, "seat", [x for row in seat.matrix for x in row])
-        turned = Matrix.of([rows[3 * i : 3 * i + 3] for i in range(3)]) @ Vector(numbers.of_body(at, "centre", com))
-        return Vector(numbers.of_body(at, "offset", seat.offset)) + turned
+        rows = constants.of_body(at, "seat", [x for row in placement.matrix for x in row])
+        turned = Matrix.of([rows[3 * i : 3 * i + 3] for i in range(3)]) @ Vector(constants.of_body(at, "centre", com))
+        return Vector(constants.of_body(at, "offset", placement.offset)) + turned
 
     @property
     def base_acceleration(self) -> tuple[Vector, Vector]:
         """Angular and linear acceleration of the inertial frame that stand for gravity."""
         return ZERO, -self.links.gravity
 
-    # -- pieces ----------------------------------------------------------------------------------------------------
+    # -- segments ----------------------------------------------------------------------------------------------------
     def traversal(self) -> Iterator[tuple[Link, bool]]:
-        """Yield (link, True) outward for this piece and its ancestors, (link, False) back for this piece's links."""
+        """Yield (link, True) outward for this segment and its ancestors, (link, False) back for this segment's
+        links."""
         for link, outward in self.links.traversal():
             if self.exchange.needs_motion_of(link) and (outward or self.exchange.own(link)):
                 yield link, outward
 
     @property
     def own_links(self) -> list[Link]:
-        """The links of this piece, parents first; all links where the whole tree is traced."""
+        """The links of this segment, parents first; all links where the whole tree is traced."""
         return [link for link in self.links.links if self.exchange.own(link)]
 
     @property
     def active_links(self) -> list[Link]:
-        """The links of this piece and those that it moves on, parents first."""
+        """The links of this segment and those that it moves on, parents first."""
         return [link for link in self.links.links if self.exchange.needs_motion_of(link)]
 
     @property
     def own_bodies(self) -> list[int]:
-        """The bodies on the links of this piece; bodies that do not move count as the first piece's."""
-        carriers, exchange = {body: seat.link for body, seat in self.links.seats.items()}, self.exchange
+        """The bodies on the links of this segment; bodies that do not move count as the first segment's."""
+        carriers, exchange = {body: placement.link for body, placement in self.links.placements.items()}, self.exchange
         return [body for body, link in carriers.items() if (exchange.is_first if link is None else exchange.own(link))]
 
     @property
-    def piece(self) -> Piece | None:
-        """The piece of an evaluation of one, for the code that couples bodies; None: it takes the whole tree."""
+    def segment(self) -> Segment | None:
+        """The segment of an evaluation of one, for the code that couples bodies; None: it takes the whole tree."""
         return None if self.exchange.alone else self.exchange.own_segments[0]
