@@ -10,9 +10,9 @@ import warp_spo as spo
 from benchmarks.table import cases
 from support import laws, oracles, symbolic, warp_machine, zoo
 from support.allocations import no_warp_allocation
-from support.segments_of_trees import TREES
 from support.robots import ROBOTS
 from support.routines import ROUTINES
+from support.segments_of_trees import TREES
 from warp_spo.execution.plan import MOST_DOFS
 from warp_spo.kernels import straight_line
 from warp_spo.recursions.derivatives import inverse_dynamics as dense

@@ -210,22 +210,24 @@ class Plan:
     def spill_slots(self, routine: Routine, shared_bytes: int, bytes_of: int, warps: int) -> int:
         """Return how many values each thread of a team sets aside in shared memory, to need fewer registers; 0: none.
 
-        As many as leave room for all the blocks that ``routine.hints.aside`` registers allow. Measured on an H200,
-        2026-11-23: G1 with variable inertias takes 841 us for 919 at 2^20 worlds. With folded ones, and with a thread
-        a world, the spills that they replace, or more registers, take less time.
+        As many as leave room for all the blocks that ``routine.hints.registers_when_spilling`` registers allow.
+        Measured on an H200, 2026-11-23: G1 with variable inertias takes 841 us for 919 at 2^20 worlds. With folded
+        ones, and with a thread a world, the spills that they replace, or more registers, take less time.
 
         Args:
             shared_bytes: of the block without these values. bytes_of: of a value. warps: of the team.
         """
         if (
-            not routine.hints.aside
+            not routine.hints.registers_when_spilling
             or not self.variable_inertia
             or self.latency_bound
             or bytes_of > 4
             or self.dofs <= SPILLS["float32"]
         ):
             return 0
-        blocks = PARTS * (self.device.registers // PARTS // (WARP_SIZE * routine.hints.aside)) // warps
+        blocks = (
+            PARTS * (self.device.registers // PARTS // (WARP_SIZE * routine.hints.registers_when_spilling)) // warps
+        )
         room = self.device.shared_bytes // max(blocks, 1) - 3 * RESERVED - shared_bytes  # Warp takes a share, too
         places = room // (WARP_SIZE * warps * bytes_of)
         return places if places >= LEAST_SPILL_SLOTS else 0
@@ -273,7 +275,7 @@ def choose(
     side_by_side = device.cuda and not shared and asked != "node" and 0 < scene.dof_count <= MOST_DOFS
     segments = Segments(Links(scene)) if side_by_side else None
     leaf_segments, segments_share_code = (
-        (len(blocks.leaves), segments.shared_code_fraction >= LEAST_SHARED_CODE[dtype]) if segments else (1, True)
+        (len(segments.leaves), segments.shared_code_fraction >= LEAST_SHARED_CODE[dtype]) if segments else (1, True)
     )
     serial = segments is not None and segments.longest_path_fraction >= SERIAL
     rule = _choose_by_rule(

@@ -141,7 +141,7 @@ class Programs:
             return multi_start.build(self, routine, links, "given" in inputs, options)
         divides = routine.divides(self.run.scene, inputs, **options)
         shared = self.plan.of(routine) == "segment" and divides
-        if shared and routine.segments and routine.segments.body_kinematics and self.builder.walks:
+        if shared and routine.segments and routine.segments.body_kinematics and self.builder.supports_body_kinematics:
             return body_kinematics.build(self.builder, job, links)
         if routine.hints.bias_first is not None and self.plan.at(routine).bias_first and "qd" in inputs:
             job = job._replace(routine=routine.hints.bias_first)

@@ -65,8 +65,9 @@ class TuningHints:
             so many blocks if a thread then still has so many registers; the first pair that applies.
         waits_late: with a thread a world, where all worlds run at once, a block has two warps, and they wait for a row
             where they first use it.
-        aside: at segment granularity, with many worlds and variable inertias, registers of a thread that sets aside in
-            shared memory what nothing uses for long, see :mod:`..trace.register_spilling`; 0: it sets nothing aside.
+        registers_when_spilling: at segment granularity, with many worlds and variable inertias, registers of a thread
+            that sets aside in shared memory what nothing uses for long, see :mod:`..trace.register_spilling`; 0: it
+            sets nothing aside.
     """
 
     short: bool = False

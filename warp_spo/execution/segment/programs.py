@@ -275,7 +275,7 @@ class _SegmentProgram:
         if places := self.plan.spill_slots(
             routine, layout.shared_bytes(T), wp.types.type_size_in_bytes(T), layout.warps
         ):
-            layout, registers = layout._replace(spill_slots=places), routine.hints.aside
+            layout, registers = layout._replace(spill_slots=places), routine.hints.registers_when_spilling
             cuda = spill_registers(cuda, C_TYPE[T], places)
         lists = {"place": table, "table": kernel.shared.table, "shifts": kernel.shared.shifts}
         tables = {name: values for name, values in lists.items() if values} | self.builder.height_tables(looks_up)

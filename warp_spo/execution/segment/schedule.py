@@ -44,14 +44,14 @@ class Schedule:
         self.warps = len(leaves)
         self._warp = {segment.index: warp for warp, segment in zip(_warps_of_leaves(leaves), leaves, strict=True)}
         self._inward = {segment.index: 0 for segment in leaves}
-        for segment in reversed(segments.segments):
+        for segment in reversed(segments.all):
             if segment.children:
                 self._hand_over(segment)
         outward = self._outward_stages()
         self.stages = max(outward) + 1
         self.assignments = [
             Assignment(self._warp[segment.index], self._inward[segment.index], outward[segment.index])
-            for segment in segments.segments
+            for segment in segments.all
         ]
 
     def _hand_over(self, segment: Segment) -> None:
@@ -66,9 +66,9 @@ class Schedule:
             warp[segment.index] = warp[awaited[0].index]
         else:
             load = [0] * self.warps
-            for other in self.segments.segments:
+            for other in self.segments.all:
                 if other.index > segment.index or not other.children:
-                    load[warp[other.index]] += other.weight
+                    load[warp[other.index]] += other.dof_count
             below = {warp[leaf.index] for leaf in self.segments.leaves if segment.root is leaf.root}
             warp[segment.index] = min(below, key=lambda one: (sum(load[one % PARTS :: PARTS]), load[one], -one))
         inward[segment.index] = max(
@@ -78,14 +78,12 @@ class Schedule:
     def _outward_stages(self) -> list[int]:
         """Return the stage of each outward sweep; all leaves have the last one, because equal ones share their code."""
         stages: list[int] = []
-        for segment in self.segments.segments:
+        for segment in self.segments.all:
             above = segment.parent
             start = 0 if above is None else stages[above.index] + (self._warp[segment.index] != self._warp[above.index])
             stages.append(max(start, self._inward[segment.index]))
         last = max(stages)
-        return [
-            stage if segment.children else last for segment, stage in zip(self.segments.segments, stages, strict=True)
-        ]
+        return [stage if segment.children else last for segment, stage in zip(self.segments.all, stages, strict=True)]
 
 
 def _warps_of_leaves(leaves: list[Segment]) -> list[int]:

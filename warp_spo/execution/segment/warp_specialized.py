@@ -116,7 +116,7 @@ class WarpSpecializedKernel:
 
     def __init__(self, schedule: Schedule, dtype: str, passes: PassLoop | None = None, pairs: str = ""):
         self.pairs = pairs
-        self.schedule, self.segments, self.passes = schedule, schedule.segments.segments, passes
+        self.schedule, self.segments, self.passes = schedule, schedule.segments.all, passes
         self.dtype, self.c = dtype, C_TYPE[dtype]
         self.shared = SharedCode(dtype)
         self._work: dict[int, SegmentCode] = {}

@@ -47,7 +47,7 @@ class Exchange(abc.ABC):
     @functools.cached_property
     def segments(self) -> list[Segment]:
         """All segments of the scene, parents first."""
-        return Segments(self.links).pieces
+        return Segments(self.links).all
 
     @property
     @abc.abstractmethod
@@ -160,7 +160,7 @@ class SegmentExchange(Exchange):
         self.is_first = index == 0
         self.parent, self.children = self.segment.parent, tuple(self.segment.children)
         self._own = {id(link) for link in self.segment.links}
-        self._active = self._own | {id(link) for piece in self.segment.ancestors for link in piece.links}
+        self._active = self._own | {id(link) for segment in self.segment.ancestors for link in segment.links}
         self._places = {dof: at for at, dof in enumerate(self.segment.dofs)}
 
     @property
@@ -178,16 +178,16 @@ class SegmentExchange(Exchange):
 
     def send(self, letter: str, segment: Segment, values: Iterable[Value]) -> list[Store]:
         first = self.offsets[letter, segment.index]
-        return [Store(messages.way(letter), (first + i,), value) for i, value in enumerate(values)]
+        return [Store(messages.channel(letter), (first + i,), value) for i, value in enumerate(values)]
 
     def receive(self, letter: str, segment: Segment) -> list[Value]:
         first, size = self.offsets[letter, segment.index], messages.size(letter, segment)
-        return [self.links.graph.input(messages.way(letter), first + i) for i in range(size)]
+        return [self.links.graph.input(messages.channel(letter), first + i) for i in range(size)]
 
     def from_children(self, link: Link, letter: str, known: dict[int, Any], build: Callable[[list], Any]) -> list[Any]:
         if self.own(link.children[0] if link.children else link):
             return [known[id(child)] for child in link.children]
-        return [build(self.receive(letter, piece)) for piece in self.children]
+        return [build(self.receive(letter, segment)) for segment in self.children]
 
     def send_to_parent(self, letter: str, link: Link, values: Iterable[Value]) -> list[Store]:
         if link is not self.segment.links[0] or link.parent is None:

@@ -261,8 +261,8 @@ class Step:
         worst_word = []
         if exchange.is_first:
             worst: Value = 0.0
-            for piece in exchange.segments:
-                (word,) = exchange.receive("S", piece)
+            for segment in exchange.segments:
+                (word,) = exchange.receive("S", segment)
                 worst = select(less(worst, word), word, worst)
             word = self._final_status(worst)
             values = trace.links.lost_values()  # here, because texts of segments of equal structure are equal
@@ -281,8 +281,8 @@ class Step:
         after = {(item.array, item.index[0]): item.value for item in self.phases.phases.epilogue}
         self.phases.add_final_messages(exchange.send("X", own, map(after.__getitem__, _entries(own))))
         sent: dict[tuple[str, int], Value] = {}
-        for piece in exchange.segments:
-            sent |= dict(zip(_entries(segment), exchange.receive("X", piece), strict=True))
+        for segment in exchange.segments:
+            sent |= dict(zip(_entries(segment), exchange.receive("X", segment), strict=True))
         moved = trace.at({"q": lambda c: sent["q_out", c], "qd": lambda dof: sent["out", dof]})
         found = [item._replace(array="poses_out") if item.array == "out" else item for item in body_states(moved)]
         self.phases.add_final_stores(found)
