@@ -20,7 +20,7 @@ from warp_spo.kernels import pass_loops, straight_line
 from warp_spo.kernels.substeps import repeat_on_cuda
 from warp_spo.recursions.contact import points, step
 from warp_spo.recursions.contact.step import REPORTS
-from warp_spo.recursions.model.tracing import Trace
+from warp_spo.recursions.model.exchange import SegmentExchange
 from warp_spo.reference.contact import ContactStep
 
 H, WORLDS = 5e-3, 4
@@ -216,10 +216,10 @@ def test_mirrored_legs_share_one_text():
 BUGS = {
     "a point that nobody takes": (points, "points_of", "first * each", "(first + 1) * each"),
     "a point that two take": (points, "points_of", "mine[each * len(segment.children) :]", "mine"),
-    "what a message leaves out": (Trace, "add_contacts", "z - self.contact_force[key]", "z"),
-    "excess of one limb": (step.ContactStepTrace, "_sent_to_the_first", "largest(list(values))", "values[0]"),
+    "what a message leaves out": (SegmentExchange, "add_contacts", "z - pushes[key]", "z"),
+    "excess of one limb": (step.ContactStepTrace, "_send_to_the_first", "largest(list(values))", "values[0]"),
     "no barrier after the passes": (pass_loops, "count_team_passes", '"}", barrier]', '"}"]'),
-    "no barrier ahead": (warp_specialized.WarpSpecializedKernel, "_before_passes", "[BARRIER] if stage else []", "[]"),
+    "no barrier ahead": (warp_specialized.WarpSpecializedKernel, "_ahead", "[BARRIER] if stage else []", "[]"),
 }
 
 

@@ -149,11 +149,11 @@ def test_what_moves_nothing_is_where_its_forces_balance(laws_of_it, count):
 
 def test_what_a_scene_does_not_have_costs_nothing():
     """Unlimited values, zeros and Newton's defaults leave the trace as it is; a law costs its own dof alone."""
-    counts = lambda scene: len(symbolic.step.step(symbolic.Trace(symbolic.Links(scene), "float64", ("q", "qd"))))  # noqa: E731
+    counts = lambda scene: len(symbolic.step.step(symbolic.Trace(symbolic.Links(scene), "float64", ("q", "qd"))).stores)  # noqa: E731
 
     def operations(scene):
         trace = symbolic.Trace(symbolic.Links(scene), "float64", ("q", "qd", "tau"))
-        stores = symbolic.step.step(trace)
+        stores = symbolic.step.step(trace).stores
         return len(symbolic.ordered(item.value for item in stores)), {item.array for item in stores}
 
     bare = zoo.plain()
@@ -180,7 +180,7 @@ def test_a_free_hinge_without_laws_keeps_its_short_way():
     )
 
     def count(scene):
-        stores = symbolic.step.step(symbolic.Trace(symbolic.Links(scene), "float64", ("q", "qd")))
+        stores = symbolic.step.step(symbolic.Trace(symbolic.Links(scene), "float64", ("q", "qd"))).stores
         return len(symbolic.ordered(item.value for item in stores))
 
     assert count(scene) * 3 < 2 * count(scene.with_values(joint_damping=np.arange(6.0)))

@@ -14,10 +14,10 @@ from support.quick import slow_unless
 from support.routines import ROUTINES
 from support.step_scenes import FORCES, TOLERANCE, H, furnished, states
 from warp_spo.execution import plan
+from warp_spo.execution.segment import programs as segment_programs
 from warp_spo.execution.segment import warp_specialized
 from warp_spo.kernels import pass_loops, straight_line
 from warp_spo.kernels.substeps import repeat_on_cuda
-from warp_spo.recursions.step import step as steps
 from warp_spo.recursions.step.step import MOST_JOINT_SPACE_DOFS, Step, by_segments
 
 WORLDS = 4
@@ -102,7 +102,7 @@ def test_equals_the_step_by_trees(integrator, device):
 @pytest.mark.parametrize(("name", "dtype"), [("hand", "float64"), ("fork", "float64"), ("driven", "float32")])
 def test_laws_in_turns_or_in_statements(name, dtype, most, device, monkeypatch):
     """Both are the dense step, of all worlds."""
-    monkeypatch.setattr(steps, "MOST_LAWS", most)
+    monkeypatch.setattr(segment_programs, "MOST_LAWS", most)
     scene = scene_of(name)
     dyn = spo.Dynamics(scene, WORLDS, device=device, dtype=dtype, granularity="segment")
     a = states(scene, WORLDS, dtype)
@@ -195,7 +195,7 @@ def test_the_step_writes_the_states_of_bodies(name, monkeypatch):
 )
 def test_warps_take_turns(name, most, monkeypatch):
     """Laws and checks in loops, and in statements."""
-    monkeypatch.setattr(steps, "MOST_LAWS", most)
+    monkeypatch.setattr(segment_programs, "MOST_LAWS", most)
     text, a, (q, qd, _) = texts_of(monkeypatch, name, status=True)
     assert ("force_row" in text.cuda) == (most == 0)
     for backwards in (False, True):

@@ -85,9 +85,10 @@ def advance(scene, arrays, h, dtype="float64", most=32, **options):
     """
     trace = Trace(Links(scene), dtype, tuple(arrays))
     if "multipliers" in arrays:
-        stores = closed_step.step_with_multipliers(trace, **options)
+        stores = closed_step.step_with_multipliers(trace, **options).stores
     else:
-        stores = closed_step.step(trace, **options) if "embedding" in options else step.step(trace, **options)
+        take = closed_step.step if "embedding" in options else step.step
+        stores = take(trace, **options).stores
     worlds = len(arrays["q"])
     known = arrays | {"dt": np.full((worlds, 1), h)}
     known |= {name: np.zeros((worlds, scene.dof_count)) for name in LOOPED}
@@ -117,9 +118,10 @@ def advance(scene, arrays, h, dtype="float64", most=32, **options):
 def contact_step(scene, arrays, h, passes=3, dtype="float64"):
     """One step with contacts: results by name, [world, ...]; arrays: q, qd and what else it gets, [world, ...]."""
     trace, worlds = Trace(Links(scene), dtype, (*arrays, "dt", "passes")), len(arrays["q"])
-    stores = contact.step(trace, True, True, contact.REPORTS)
+    phases = contact.step(trace, True, True, contact.REPORTS)
+    stores = phases.stores
     known = arrays | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
-    known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(trace.prologue)))}
+    known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(phases.prologue)))}
     known[GROUND] = by_cell(scene.ground.heights).ravel() if hasattr(scene.ground, "heights") else np.zeros(0)
 
     def stored(some, found):
@@ -128,7 +130,7 @@ def contact_step(scene, arrays, h, passes=3, dtype="float64"):
             found[item.array][(slice(None), *item.index)] = value
         return found
 
-    known |= stored(trace.prologue, {SECANT: known[SECANT]})
+    known |= stored(phases.prologue, {SECANT: known[SECANT]})
     looped = [item for item in stores if item.array in (GAIN, SECANT)]
     for number in range(passes):
         known["pass"] = np.full((worlds, 1), float(number))

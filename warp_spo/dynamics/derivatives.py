@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import warp as wp
 
 from ..execution.programs import Program
-from ..execution.routine import Routine
+from ..execution.routine import Routine, SegmentForm, TuningHints
 from ..kernels import tiles
 from ..kernels.straight_line import TILE
 from ..recursions.derivatives import inverse_dynamics as recursion
@@ -67,9 +67,8 @@ INVERSE_DYNAMICS_DERIVATIVES = Operation(
     routine=Routine(
         "inverse_dynamics_derivatives",
         recursion.inverse_dynamics_derivatives,
-        letters=recursion.LETTERS,
-        long_result=True,
-        tiled=True,
+        segments=SegmentForm(messages=recursion.LETTERS),
+        hints=TuningHints(long_result=True, tiled=True),
     ),
     embed=NO_DERIVATIVE,
     multipliers=NO_DERIVATIVE,
@@ -181,7 +180,7 @@ MASS_MATRIX_DERIVATIVE = Operation(
     "mass_matrix_derivative",
     arguments=(Q,),
     results=(Result("derivative", "world, dof, dof, dof"),),
-    routine=Routine("mass_matrix_derivative", recursion.mass_matrix_derivative, tiled=True),
+    routine=Routine("mass_matrix_derivative", recursion.mass_matrix_derivative, hints=TuningHints(tiled=True)),
     embed=NO_DERIVATIVE,
     multipliers=NO_DERIVATIVE,
 )

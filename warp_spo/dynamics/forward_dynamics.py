@@ -9,7 +9,7 @@ import warp as wp
 
 from ..execution import status_words as words
 from ..execution.node import operations as node_operations
-from ..execution.routine import Routine
+from ..execution.routine import Routine, SegmentForm, TuningHints
 from ..recursions import forward_dynamics as recursion
 from ..recursions.derivatives import adjoints
 from ..recursions.loops import embedded_adjoints
@@ -55,7 +55,9 @@ def _pull_forward_dynamics(
     return gradients.dyn.forward_dynamics_vjp(**given, cotangent=cotangent, qdd=qdd, wrt=wrt)
 
 
-AND_SOLVE = Routine("forward_dynamics_and_solve", recursion.forward_dynamics_and_solve, letters="Pzayb")
+AND_SOLVE = Routine(
+    "forward_dynamics_and_solve", recursion.forward_dynamics_and_solve, segments=SegmentForm(messages="Pzayb")
+)
 
 FORWARD_DYNAMICS = Operation(
     "forward_dynamics",
@@ -65,17 +67,17 @@ FORWARD_DYNAMICS = Operation(
         "forward_dynamics",
         recursion.forward_dynamics,
         node_operations.forward_dynamics,
-        letters="Pza",
-        collects=True,
-        registers_when_spilling=168,
-        bias_first=Routine(
-            "forward_dynamics_apart",
-            recursion.forward_dynamics_bias_first,
-            node_operations.forward_dynamics,
-            letters="fPza",
+        segments=SegmentForm(messages="Pza"),
+        hints=TuningHints(
             collects=True,
-            occupancy=((4, 128), (3, 168), (2, 128)),
-            waits_late=True,
+            registers_when_spilling=168,
+            bias_first=Routine(
+                "forward_dynamics_apart",
+                recursion.forward_dynamics_bias_first,
+                node_operations.forward_dynamics,
+                segments=SegmentForm(messages="fPza"),
+                hints=TuningHints(collects=True, occupancy=((4, 128), (3, 168), (2, 128)), waits_late=True),
+            ),
         ),
     ),
     embed=EMBEDDED_FORWARD_DYNAMICS,
@@ -84,9 +86,8 @@ FORWARD_DYNAMICS = Operation(
         Routine(
             "forward_dynamics_vjp",
             adjoints.forward_dynamics_vjp,
-            letters="B",
-            divides=_divides_once_solved,
-            occupancy=((4, 128),),
+            segments=SegmentForm(messages="B", divides=_divides_once_solved),
+            hints=TuningHints(occupancy=((4, 128),)),
         ),
         by=("q", "qd", "tau", "body_f"),
         embed=Routine("embedded_forward_dynamics_vjp", embedded_adjoints.forward_dynamics_vjp),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..execution.routine import Routine
+from ..execution.routine import Routine, TuningHints
 from ..recursions import regressor as recursion
 from ..runtime.arrays import AnyArray, ArrayT
 from .operation import AS_WRITTEN, QD, QDD, TAU, Argument, Operation, Q, Refused, Result, Trial, required
@@ -18,7 +18,9 @@ INVERSE_DYNAMICS_REGRESSOR = Operation(
     "inverse_dynamics_regressor",
     arguments=(Q, QD, QDD),
     results=(Result("regressor", "world, dof, 10 bodies"),),
-    routine=Routine("inverse_dynamics_regressor", recursion.inverse_dynamics_regressor, long_result=True),
+    routine=Routine(
+        "inverse_dynamics_regressor", recursion.inverse_dynamics_regressor, hints=TuningHints(long_result=True)
+    ),
     embed=OPEN,
     sharing=Refused("differentiate inverse_dynamics by the values"),
     multipliers=AS_WRITTEN,

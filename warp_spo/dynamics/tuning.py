@@ -96,7 +96,7 @@ def _tune_one(dyn: Dynamics, operation: Operation) -> Tuned:
     dyn._engine.refuse(operation.name, operation)
     routine = _routine(dyn, operation)
     candidates = dyn.plan.candidates(routine)
-    if routine.couples and not routine.divides(dyn.scene, ()):
+    if routine.couples_bodies and not routine.divides(dyn.scene, ()):
         candidates = ("tree",)
     if len(candidates) == 1:
         return Tuned(candidates[0])
@@ -157,7 +157,7 @@ def _switch(dyn: Dynamics, name: str, granularity: str | None) -> None:
     every = [one.routine for one in dyn._operations.values() if one.routine is not None]
     every += [one.touching(dyn) for one in dyn._operations.values() if one.touching is not None]
     routines = [one for one in every if one.name == name]
-    names = {name, *(one.bias_first.name for one in routines if one.bias_first is not None)}
+    names = {name, *(one.hints.bias_first.name for one in routines if one.hints.bias_first is not None)}
     for each in names:
         plan.tuned_plans.pop(each, None)
     if granularity is not None and any(plan.of(one) != granularity for one in routines):

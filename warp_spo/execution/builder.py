@@ -127,8 +127,8 @@ class Builder:
         routine, more = job.routine, job.more
         whole = "poses_out" in more
         gathers = whole or self.plan.gathers(routine, warps, 1 + len(more))
-        ways = self.plan.stages(routine, warps), gathers, routine.tiled
-        wide = routine.wide and warps > 1
+        ways = self.plan.stages(routine, warps), gathers, routine.hints.tiled
+        wide = routine.segments is not None and routine.segments.wide and warps > 1
         room = self.room(wide, whole=whole)
         given = stores, everything, job.shapes, more, sent, warps, self.run.dtype
         return staging.choose_layout(*given, *ways, self.relays, room, wide)

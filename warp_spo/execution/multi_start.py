@@ -10,6 +10,7 @@ from ..kernels import multi_start, native
 from ..kernels.fields import axes
 from ..recursions.model.links import Links
 from ..recursions.model.tracing import Trace
+from ..recursions.step.phases import as_phases
 from ..runtime import launches
 from ..trace.emission import Emitter, render
 from .routine import Routine
@@ -30,7 +31,7 @@ def build(programs: Programs, routine: Routine, links: Links, given: bool, optio
     assert routine.start is not None
     inputs = ("q", "target", "weight", "share", "first", *(("given",) if given else ()))
     trace = Trace(links, dtype, inputs)
-    start, step = routine.start(trace, **options), routine.trace(trace, **options)
+    start, step = routine.start(trace, **options), as_phases(routine.trace(trace, **options)).sweep
     used = read_entries([*start, *step])
     fields = [name for name in FIELDS if name in used]
     at_start, at_step = (

@@ -88,11 +88,11 @@ def mass_matrix(trace: Trace) -> list[Store]:
         key = id(link)
         trace.label(link, "R")
         body = link.grouped or NOTHING
-        for other in trace.from_children(link, "R", carried, Rigid.unpacked):
+        for other in trace.exchange.from_children(link, "R", carried, Rigid.unpacked):
             body = body + other
         if link.parent is not None:
             carried[key] = trace.places[key].pose.rigid_to_parent(body)
-            stores += trace.send_to_parent("R", link, carried[key].packed)
+            stores += trace.exchange.send_to_parent("R", link, carried[key].packed)
         trace.label(link, "F")
         for at, value in entries(link, trace.places, body, shared).items():
             found[at] = found[at] + value if at in found else value  # links of a group add to the same entries

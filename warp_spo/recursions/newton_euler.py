@@ -123,7 +123,7 @@ def inverse_dynamics(
         f = -trace.external_wrench(link)
         if link.grouped is not None:
             f = f + body_force(link.grouped, trace.motions[key], *alpha[key])
-        for other in trace.from_children(link, letter, forces, Vector):
+        for other in trace.exchange.from_children(link, letter, forces, Vector):
             f = f + other
         n, f = Vector(f[:3]), Vector(f[3:])
         mass = trace.links.carried_mass(link)
@@ -140,5 +140,5 @@ def inverse_dynamics(
         if link.parent is not None:
             n, f = trace.places[key].pose.force_to_parent(n, f)
             forces[key] = Vector((*n, *f))
-            stores += trace.send_to_parent(letter, link, forces[key])
+            stores += trace.exchange.send_to_parent(letter, link, forces[key])
     return stores

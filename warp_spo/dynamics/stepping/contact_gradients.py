@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from ...execution.height_gradients import HeightSums
-from ...execution.routine import Routine
+from ...execution.routine import Routine, SegmentForm, TuningHints
 from ...recursions.contact.ground import CORNERS, corner_steps
 from ...recursions.contact.points import surface_numbers
 from ...recursions.contact.step import PASSES
@@ -31,7 +31,7 @@ from ...recursions.derivatives.contact_pass import (
 )
 from ...recursions.model.messages import SIZES
 from ...recursions.model.tracing import Trace
-from ...scene.ground import HEIGHTS, HeightField
+from ...scene.contacts import HEIGHTS, HeightField
 from . import midpoint_contact, midpoint_contact_gradients
 
 if TYPE_CHECKING:
@@ -42,12 +42,25 @@ def _divides(scene: Any, inputs: Any, apart: bool, **_: Any) -> bool:
     return apart
 
 
-PASS = Routine("contact_pass", contact_pass, letters="Pzaf", crowded=True, wide=True)
-SOLVE = Routine("contact_solve", contact.contact_solve, letters="Pza", crowded=True, wide=True)
-GRADIENT = Routine(
-    "contact_gradient", contact.contact_gradient, letters="BGO", divides=_divides, crowded=True, wide=True
+PASS = Routine(
+    "contact_pass", contact_pass, segments=SegmentForm(messages="Pzaf", wide=True), hints=TuningHints(crowded=True)
 )
-WEIGHED = {SOLVE: dataclasses.replace(SOLVE, letters="PzaQ"), GRADIENT: dataclasses.replace(GRADIENT, letters="PBGO")}
+SOLVE = Routine(
+    "contact_solve",
+    contact.contact_solve,
+    segments=SegmentForm(messages="Pza", wide=True),
+    hints=TuningHints(crowded=True),
+)
+GRADIENT = Routine(
+    "contact_gradient",
+    contact.contact_gradient,
+    segments=SegmentForm(messages="BGO", divides=_divides, wide=True),
+    hints=TuningHints(crowded=True),
+)
+WEIGHED = {
+    SOLVE: dataclasses.replace(SOLVE, segments=SegmentForm(messages="PzaQ", wide=True)),
+    GRADIENT: dataclasses.replace(GRADIENT, segments=SegmentForm(messages="PBGO", divides=_divides, wide=True)),
+}
 """The same where limbs tell each other how inertias count that joints further in feel."""
 NOT_READ = ("qdd", "q_cotangent", "qd_cotangent")  # of the arrays that are given, what the passes do not read
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import warp as wp
 
 from ...errors import UnsupportedError
-from ...execution.routine import Routine
+from ...execution.routine import PassForm, Routine, SegmentForm
 from ...kernels import combination, loops
 from ...kernels.substeps import SUBSTEPS
 from ...recursions import coordinates, kinematics
@@ -43,16 +43,20 @@ def _limbs_couple(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
     return pair_pieces.by_limbs(scene)
 
 
-STEP = Routine("step", recursion.step, letters="PzaSX", divides=_divides, passes=True, wide=True)
+STEP = Routine(
+    "step", recursion.step, segments=SegmentForm(messages="PzaSX", divides=_divides, wide=True), passes=PassForm()
+)
 BODIES_BY_KINEMATICS = Routine(
-    "body_states", kinematics.body_states, alone=True, passes=True, wide=True, body_kinematics=True
+    "body_states", kinematics.body_states, segments=SegmentForm(wide=True, body_kinematics=True), passes=PassForm()
 )
 PAIRED_STEP = Routine(
-    "paired_step", pair_pieces.step, letters="PzafSE", divides=_limbs_couple, passes=True, counted=True, wide=True,
-    couples=True,
-)  # fmt: skip
-EMBEDDED_STEP = Routine("step", closed_step.step, passes=True)
-STEP_UNDER_MULTIPLIERS = Routine("step", closed_step.step_with_multipliers, passes=True)
+    "paired_step",
+    pair_pieces.step,
+    segments=SegmentForm(messages="PzafSE", divides=_limbs_couple, wide=True, couples_bodies=True),
+    passes=PassForm(counted=True),
+)
+EMBEDDED_STEP = Routine("step", closed_step.step, passes=PassForm())
+STEP_UNDER_MULTIPLIERS = Routine("step", closed_step.step_with_multipliers, passes=PassForm())
 STEP_SYSTEM = Routine("step_system", closed_step.step_system)
 CLOSURES_OPEN = Routine("closures_open", multipliers.closures_open)
 INTEGRATE = Routine("integrate", coordinates.integrate)

@@ -38,7 +38,8 @@ def build(builder: Builder, job: Job, links: Links) -> Program | None:
     lists = {"table": shared.table, "shifts": shared.shifts, body_frames.GEOMETRY: body_frames.geometry(links.scene)}
     tables = {name: values for name, values in lists.items() if values}
     layout = layout._replace(near=(("shifts", len(shared.shifts)),))
-    if not layout.fits(builder.run.dtype, builder.room(job.routine.wide)):
+    assert job.routine.segments is not None
+    if not layout.fits(builder.run.dtype, builder.room(job.routine.segments.wide)):
         return None
     name = body_frames.GEOMETRY.upper()
     cuda = f"#define {name}(i) __ldg(geometry.data + i)\n{declared}\n{cuda}\n#undef {name}"

@@ -28,6 +28,7 @@ from .ties import Aggregate, TiePlan, key
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace
+    from ..step.phases import PhaseBuilder
 
 UNITS = [Vector(1.0 if i == j else 0.0 for i in range(6)) for j in range(6)]
 LAST = 27  # entries of a couple: the upper triangle of its damper K, order (omega; v), and its load f0, (n; f)
@@ -261,7 +262,9 @@ def force_to_parent(pose: Pose, z: Vector) -> Vector:
     return Vector((*n, *f))
 
 
-def reduce(trace: Trace, plan: TiePlan, nodes: dict[int, Node], tau: Callable[[int], Value]) -> tuple[Factors, dict]:
+def reduce(
+    trace: Trace, plan: TiePlan, nodes: dict[int, Node], tau: Callable[[int], Value], phases: PhaseBuilder
+) -> tuple[Factors, dict]:
     """Sweep inward; ``nodes`` by id of the first link of each aggregate. Return factors and D^-1 eps, by link."""
     done: Factors = {}
     rates: dict[int, list[Value]] = {}
@@ -270,7 +273,7 @@ def reduce(trace: Trace, plan: TiePlan, nodes: dict[int, Node], tau: Callable[[i
     own: dict[int, Vector] = {}
     for link in trace.links.links:
         trace.place(link)
-        trace.pass_invariants += trace.places[id(link)].pose.turn or ()
+        phases.add_invariants(trace.places[id(link)].pose.turn or ())
     for link in reversed(plan.order):
         at, place = id(link), trace.places[id(link)]
         eliminate(trace, link, done, inner)

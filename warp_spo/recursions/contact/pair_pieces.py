@@ -23,6 +23,7 @@ from ..model.links import Link, Links
 from ..model.messages import INWARD, OUTWARD
 from ..model.segments import Segment, Segments
 from ..motion import STILL
+from ..step.phases import StepPhases
 from .coupled import CoupledStep, suits
 from .couples import EXCESS, Team
 from .pairs import (
@@ -89,15 +90,17 @@ def by_limbs(scene: Scene) -> bool:
     """Whether limbs side by side can take a step of a scene with pairs."""
     links = Links(scene)
     segments = Segments(links)
-    return segments.warps > 1 and seats_of(links, segments) is not None
+    return len(segments.leaves) > 1 and seats_of(links, segments) is not None
 
 
-def team(links: Links, segments: Segments, alpha: int, first: int) -> Team:
-    """Return the pairs of a scene for their native code; ``alpha``, ``first``: as there."""
+def team(links: Links, segments: Segments, alpha: int, first: int, warps_of: list[int]) -> Team:
+    """Return the pairs of a scene for their native code; ``alpha``, ``first``: as there; ``warps_of``: each
+    segment's."""
     seats, scene = seats_of(links, segments), links.scene
     assert seats is not None
     points, eps = zip(*((pair.points, pair.eps) for pair in scene.contact_pairs), strict=True)
-    limbs, warps = (tuple(getattr(segment, name) for segment in seats.limbs) for name in ("index", "warp"))
+    limbs = tuple(segment.index for segment in seats.limbs)
+    warps = tuple(warps_of[limb] for limb in limbs)
     dofs = tuple(segment.dof_count for segment in seats.limbs)
     seated = tuple(segment.parent is not None for segment in seats.limbs)
     weights, solids = tuple(inverse_weights(scene)), solids_of(links)[0]
@@ -120,13 +123,12 @@ class PairedSegment(ContactStepTrace):
         self.own = {number: body for number, (body, limb) in mine if limb.index == trace.segment.index}
         self.is_base = seats.base is not None and seats.base.index == trace.segment.index
 
-    def stores(self, qdd: bool, status: bool) -> list[Store]:
-        """Return the stores of a pass; ``trace.couples`` are those that only couples that touch need."""
+    def stores(self, qdd: bool, status: bool) -> StepPhases:
+        """Return the stores of the step; ``trace.couples`` are those that only couples that touch need."""
         self.first: list[Store] = []
         self.twists: list[Store] = []
         found = super().stores(qdd, status)
-        self.trace.prologue = [*self.trace.prologue, *self.first]
-        return found + self.twists
+        return found._replace(prologue=found.prologue + self.first, sweep=found.sweep + self.twists)
 
     # -- before the passes -----------------------------------------------------------------------------------------
     def _press(self, points: list[TracedContactPoint], states: list[PointState]) -> None:
@@ -150,7 +152,7 @@ class PairedSegment(ContactStepTrace):
             trace.label(link, f"T{number}_")
             (w, v), R = self.before[id(link)], trace.axes[id(link)]
             self._store(self.first, "twist", number, 6, (*velocity(R, w, v, arm), *(R @ w)))
-            trace.pass_invariants += [*(entry for row in R for entry in row), *w, *v]
+            self.phases.add_invariants([*(entry for row in R for entry in row), *w, *v])
             self._add_push(link, self._wrench(number, INWARD))
         if self.is_base:
             link = trace.segment.links[-1]
@@ -285,7 +287,7 @@ class PairedSegment(ContactStepTrace):
         return stores
 
 
-def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> list[Store]:
+def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> StepPhases:
     """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world; and the ``reports``"""
     alone = CoupledStep if suits(trace.links) else PairedStep
     form = alone if trace.segment is None else PairedSegment

@@ -64,7 +64,9 @@ def inverse_dynamics_derivatives(trace: Trace, mass: bool = True) -> list[Store]
         for arm, pull, torque in _wrenches(trace, link):
             all_in = all_in + sensitivity.under_load(arm, pull, torque)
             n, f = n - torque - cross(arm, pull), f - pull
-        for parts in zip(*(trace.from_children(link, letter, inner[letter], list) for letter in letters), strict=True):
+        for parts in zip(
+            *(trace.exchange.from_children(link, letter, inner[letter], list) for letter in letters), strict=True
+        ):
             values = dict(zip(letters, parts, strict=True))
             all_in = all_in + CarriedSums.unpacked(values)
             n, f = n + Vector(values["f"][:3]), f + Vector(values["f"][3:])
@@ -73,7 +75,7 @@ def inverse_dynamics_derivatives(trace: Trace, mass: bool = True) -> list[Store]
             values = sensitivity.to_parent(place, drifts[key], all_in).packed | {"f": [*n_over, *f_over]}
             for letter in letters:
                 inner[letter][key] = values[letter]
-                stores += trace.send_to_parent(letter, link, values[letter])
+                stores += trace.exchange.send_to_parent(letter, link, values[letter])
         stores += _entries(trace, link, all_in, (n, f), own, drifts, shared)
         for (i, j), x in link.coupling_inertia.items():
             a, b = link.dofs[i], link.dofs[j]

@@ -120,9 +120,9 @@ class Power:
                 trace.axes[key] = seen[key].axes
                 continue
             trace.label(link, "g")
-            others = trace.from_children(link, "B", bars, list)
+            others = trace.exchange.from_children(link, "B", bars, list)
             bars[key] = self._pull_to_parent(link, seen[key], moved[key], carried[key], seen[over], others)
-            self.stores += trace.send_to_parent("B", link, bars[key])
+            self.stores += trace.exchange.send_to_parent("B", link, bars[key])
 
     def _motion_of_link(self, link: Link, carried: list[Vector]) -> Moving:
         """Return the motion of a link with its own rates added."""

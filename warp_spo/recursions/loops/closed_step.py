@@ -21,6 +21,7 @@ from ...trace.spatial import total
 from ..articulated_sweeps import expand, reduce
 from ..coordinates import integrate_link
 from ..model.links import Link, place_link
+from ..step.phases import StepPhases
 from ..step.step import Step, all_finite
 from . import clusters
 from .closures import CouplingConstraint, count_open_rows
@@ -138,12 +139,12 @@ class MultiplierStep(Step):
         return 1.0 - less(self.trace.epsilon**0.5, self.trace.graph.input("resolved", 0))
 
 
-def step(trace: Trace, embedding: Embedding, qdd: bool = False, status: bool = False) -> list[Store]:
+def step(trace: Trace, embedding: Embedding, qdd: bool = False, status: bool = False) -> StepPhases:
     """out = qd', q_out = q', qdd_out, status of a step with loops embedded"""
     return ClosedStep(trace, embedding).stores(qdd, status)
 
 
-def step_with_multipliers(trace: Trace, qdd: bool = False, status: bool = False) -> list[Store]:
+def step_with_multipliers(trace: Trace, qdd: bool = False, status: bool = False) -> StepPhases:
     """out = qd', q_out = q', qdd_out, status of a step of the open tree under the array "multipliers\""""
     return MultiplierStep(trace).stores(qdd, status)
 
