@@ -78,7 +78,10 @@ def test_forward_dynamics_has_the_same_bits(device):
     plain = render(emitter.region(stores), "float32")
     rows = [shared_rows.SharedRow(name, 2, array.shape[1]) for name, array in given.items()]
     frame = straight_line.KernelLayout(
-        rows=rows, staged=False, fields=[], result=straight_line.ResultLayout(straight_line.DIRECT, rows[1]._replace(name="out")),
+        rows=rows,
+        staged=False,
+        fields=[],
+        result=straight_line.ResultLayout(straight_line.DIRECT, rows[1]._replace(name="out")),
         messages=0, warps=1, block=32)  # fmt: skip
     found = []
     for places in (0, 4, 40):
@@ -110,7 +113,7 @@ def test_values_are_set_aside_where_blocks_have_room():
     assert choose(scene, 65536, MEASURED, "float32").spill_slots(routine, size, 4, 4) == 0
     assert many.spill_slots(routine, 2 * size, 8, 4) == 0
     assert many.spill_slots(routine, 2 * size, 4, 4) == 0
-    assert many.spill_slots(routine.hints.bias_first, size, 4, 4) == 0
+    assert many.spill_slots(routine.bias_first, size, 4, 4) == 0
     assert (
         choose(zoo.branched(3), 65536, MEASURED, "float32", variable_inertia=True).spill_slots(routine, size, 4, 4) == 0
     )

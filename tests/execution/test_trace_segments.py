@@ -15,7 +15,6 @@ from support.routines import ROUTINES
 from support.segments_of_trees import TREES, hand
 from warp_spo.execution import plan
 from warp_spo.execution.segment import shared_code
-from warp_spo.execution.segment.schedule import Schedule
 from warp_spo.kernels import straight_line
 from warp_spo.recursions.model import shared_constants
 from warp_spo.recursions.model.links import Links
@@ -38,21 +37,18 @@ def test_segments_are_chains(name):
         assert all(
             child.index > segment.index and child.links[0].parent is segment.links[-1] for child in segment.children
         )
-    schedule = Schedule(segments)
-    leaves = [schedule.assignments[segment.index].warp for segment in segments.leaves]
-    assert sorted(leaves) == [*range(schedule.warps)]
+    leaves = [segment.warp for segment in segments.all if not segment.children]
+    assert sorted(leaves) == [*range(segments.warps)]
 
 
 @pytest.mark.parametrize("name", TREES)
 def test_segments_wait_for_each_other(name):
     """A warp reads results of other warps only from earlier stages; within a warp, inward comes before outward."""
-    schedule = Schedule(Segments(Links(TREES[name]())))
-    for segment in schedule.segments.segments:
-        own = schedule.assignments[segment.index]
-        assert 0 <= own.inward <= own.outward < schedule.stages
-        for child in (schedule.assignments[one.index] for one in segment.children):
-            assert child.inward + (child.warp != own.warp) <= own.inward
-            assert own.outward + (child.warp != own.warp) <= child.outward
+    for segment in (segments := Segments(Links(TREES[name]()))).all:
+        assert 0 <= segment.inward <= segment.outward < segments.stages
+        for child in segment.children:
+            assert child.inward + (child.warp != segment.warp) <= segment.inward
+            assert segment.outward + (child.warp != segment.warp) <= child.outward
 
 
 SEGMENTED = {"forward_dynamics": ("qd", "tau", "body_f"), "inverse_dynamics": ("qd", "qdd", "body_f"),

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ...scene.pairs import SWEPT_SEGMENT
 from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Value, sqrt
@@ -119,8 +118,7 @@ def solids_of(links: Links) -> tuple[Solids, tuple[int, ...], tuple[tuple[int, t
     of = [[None if one.hull is None else Polyhedron(one.hull.planes, one.hull.edges) for one in both] for both in kinds]
     hull = tuple((hulls.setdefault(a, len(hulls) - 1), hulls.setdefault(b, len(hulls) - 1)) for a, b in of)
     solids = Solids(
-        len(bodies), len(shapes), tuple(sides),
-        tuple((a.kind != SWEPT_SEGMENT, b.kind != SWEPT_SEGMENT) for a, b in kinds),
+        len(bodies), len(shapes), tuple(sides), tuple((a.has_faces, b.has_faces) for a, b in kinds),
         tuple((*a.size.tolist(), *b.size.tolist()) for a, b in kinds), tuple((a.radius, b.radius) for a, b in kinds),
         hull, tuple(one for one in hulls if one is not None),
     )  # fmt: skip
