@@ -330,4 +330,4 @@ def mark_unsettled(T) -> wp.Kernel:
     return kernel
 
 
-KERNELS = (lost_digits, status_word, mark_unsettled)
+KERNELS = (lost_digits, status_word)  # at node granularity; mark_unsettled takes a scalar type and has its own module
