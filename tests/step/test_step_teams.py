@@ -10,6 +10,7 @@ import warp_spo as spo
 from support import actuated, implicit, laws, symbolic, warp_machine, zoo
 from support.granularity_scenes import MANY, hand
 from support.routines import ROUTINES
+from support.step_calls import bundled
 from support.step_scenes import FORCES, TOLERANCE, H, furnished, states
 from warp_spo.execution import plan
 from warp_spo.execution.segment import warp_specialized as teams
@@ -39,7 +40,7 @@ def scene_of(name):
 
 
 def step(dyn, a, **more):
-    return dyn.step(a["q"], a["qd"], a["tau"], H, *(a[name] for name in FORCES[1:]), **more)
+    return dyn.step(a["q"], a["qd"], a["tau"], H, **{n: a[n] for n in FORCES[1:]}, **bundled(**more))
 
 
 @pytest.mark.parametrize(
