@@ -20,6 +20,9 @@ An :class:`Operation` stands right above the method that it declares::
 and ``mass_matrix = inertia.mass_matrix`` is its line in the class. Checks of arguments, refusals with closed loops,
 ``prepare``, gradients in torch, trials, the main job's table and the benchmarks read the declaration.
 
+An operation of many arguments has ``bundles``: objects that hold some of them. Its method takes all by their own names
+and is called ``_step``, and ``@STEP.public`` stands above the signature that users see.
+
 Axes are written as words: "world, dof". The words are "world", "coordinate", "dof", "independent dof" (the dofs that
 move all others where loops are embedded, otherwise all dofs), "body", "frame", "6 frames" (six for each frame), "10
 bodies", "row" (of the closures of loops), "actuator", "contact" (each point), "entry" (of a packed matrix), and
