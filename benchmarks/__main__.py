@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from warp_spo.__main__ import find_device
-from warp_spo.trials import drawing
+from warp_spo.viewing import charts
 
 from .table import cases as data
 from .table import commits, evidence, pictures, roofline, runner, table
@@ -80,7 +80,7 @@ def main(argv: list[str] | None = None) -> int:
                 return compare(*map(Path, options.compare))
             return compare_commits(options)
         if options.readme:
-            write_readme(drawing.load_pyplot("--readme"), options.readme)
+            write_readme(charts.load_pyplot("--readme"), options.readme)
             return 0
         if options.json:
             runner.check_place("--json", options.json)
@@ -136,7 +136,7 @@ def write_readme(pyplot: Any, source: Path) -> None:
     for name, figure in zip(table.PICTURES, (pictures.headline, pictures.scaling), strict=True):
         drawn = figure(pyplot, found[0])
         if drawn is not None:
-            (evidence.RESULTS / name).write_text(drawing.svg(drawn))
+            (evidence.RESULTS / name).write_text(charts.svg(drawn))
             pyplot.close(drawn)
 
 

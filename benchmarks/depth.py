@@ -33,9 +33,9 @@ import warp as wp
 
 import warp_spo as spo
 from warp_spo.execution import plan
-from warp_spo.trials import drawing
 from warp_spo.trials.inputs import OPERATIONS, Inputs
 from warp_spo.trials.trial import Subject, Trial
+from warp_spo.viewing import charts
 
 from .table import runner
 from .table.resources import record_launches
@@ -241,25 +241,25 @@ def resolvents(device: wp.Device, dtype: str, sizes: tuple[int, ...]) -> list[di
     return rows
 
 
-@drawing.style()
+@charts.style()
 def picture(run: dict) -> str:
     """Return SVG text: time of forward dynamics of chains against bodies, a panel for each number of worlds."""
-    pyplot = drawing.load_pyplot("--draw")
+    pyplot = charts.load_pyplot("--draw")
     rows = [row for row in run["rows"] if row["scene"] == "chain" and row["dtype"] == "float32"]
     panels = sorted({row["worlds"] for row in rows})
     lines = {
-        "sweeps, a launch a level": ("levels", drawing.OTHER, "--"),
-        "sweeps, a thread a path": ("paths", drawing.OTHER, "-"),
-        "straight-line code": ("tree", drawing.OURS_DARK, ":"),
-        "fastest scan": ("scan", drawing.OURS, "-"),
+        "sweeps, a launch a level": ("levels", charts.OTHER, "--"),
+        "sweeps, a thread a path": ("paths", charts.OTHER, "-"),
+        "straight-line code": ("tree", charts.OURS_DARK, ":"),
+        "fastest scan": ("scan", charts.OURS, "-"),
     }
     figure, grid = pyplot.subplots(
         1, len(panels), figsize=(10.4, 3.9), layout="constrained", squeeze=False, sharey=True
     )
     for axes, worlds in zip(grid[0], panels, strict=True):
         here = [row for row in rows if row["worlds"] == worlds]
-        drawing.log_axis(axes.xaxis, [row["bodies"] for row in rows], drawing.count_text)
-        drawing.log_axis(axes.yaxis, [row["us"] for row in rows], drawing.time_text)
+        charts.log_axis(axes.xaxis, [row["bodies"] for row in rows], charts.count_text)
+        charts.log_axis(axes.yaxis, [row["us"] for row in rows], charts.time_text)
         for label, (method, color, dashes) in lines.items():
             best: dict[int, float] = {}
             for row in here:
@@ -277,9 +277,9 @@ def picture(run: dict) -> str:
         axes.set(title=f"{worlds:,} world{'s' * (worlds > 1)}", xlabel="bodies of the chain")
         axes.label_outer()
     grid[0][0].set_ylabel("run time")
-    drawing.title(figure, f"Forward dynamics of chains, {run['machine']['device']}, float32")
-    drawing.legend_below(figure, grid[0][0].get_legend_handles_labels()[0])
-    return drawing.svg(figure)
+    charts.title(figure, f"Forward dynamics of chains, {run['machine']['device']}, float32")
+    charts.legend_below(figure, grid[0][0].get_legend_handles_labels()[0])
+    return charts.svg(figure)
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_spo.trials import drawing
+from warp_spo.viewing import charts
 
 from . import boom
 from .boom import Simulation
@@ -61,11 +61,11 @@ CABLE = EXUDYN | dict(sparse=(True, False))
 FRAME = EXUDYN | dict(radius=(0.6, 1.0), rotation=("RotationRxyz", "RotationEulerParameters"))
 ROD: dict[str, tuple] = dict(iterations=(5, 10, 20), stretch=(1e4, 1e5))
 FAMILIES = {
-    "warp_spo, one world": (drawing.OURS, "o-"),
-    f"warp_spo, {WORLDS:,} worlds, time of each": (drawing.OURS_DARK, "o--"),
+    "warp_spo, one world": (charts.OURS, "o-"),
+    f"warp_spo, {WORLDS:,} worlds, time of each": (charts.OURS_DARK, "o--"),
     "Exudyn, cable elements": ("#27408b", "s-"),
     "Exudyn, floating frame with modes": ("#27408b", "^--"),
-    "Newton, rods by VBD": (drawing.LIBRARIES["Newton"], "D-"),
+    "Newton, rods by VBD": (charts.LIBRARIES["Newton"], "D-"),
 }
 """Rows that are drawn as one line: colour, marker and dashes."""
 
@@ -167,7 +167,7 @@ def title_of(row: dict) -> str:
 
 
 # -- the picture -------------------------------------------------------------------------------------------------------
-@drawing.style()
+@charts.style()
 def picture(rows: list[dict]) -> Any:
     """Return the figure: error against run time of one world; lines join the rows of a family that none of it beats.
 
@@ -175,7 +175,7 @@ def picture(rows: list[dict]) -> Any:
     """
     from matplotlib.lines import Line2D
 
-    pyplot = drawing.load_pyplot("--write")
+    pyplot = charts.load_pyplot("--write")
     rows = [
         row
         for row in rows
@@ -183,10 +183,10 @@ def picture(rows: list[dict]) -> Any:
     ]
     figure, axes = pyplot.subplots(figsize=(9.6, 6.0), layout="constrained")
     times = [1e3 * row["ms"] / row["worlds"] for row in rows]
-    drawing.log_axis(axes.xaxis, times, drawing.time_text)
-    drawing.log_axis(axes.yaxis, [row["error"] for row in rows], drawing.power_text)
+    charts.log_axis(axes.xaxis, times, charts.time_text)
+    charts.log_axis(axes.yaxis, [row["error"] for row in rows], charts.power_text)
     axes.set(xlabel=f"run time of {boom.SECONDS:g} s on one core", ylabel="error of the tip's path [m]")
-    drawing.title(figure, "A boom of 2 m falls: lower left is better")
+    charts.title(figure, "A boom of 2 m falls: lower left is better")
     handles, names, also = [], [], []
     for family, (color, style) in FAMILIES.items():
         mine = [(1e3 * row["ms"] / row["worlds"], row["error"], row) for row in rows if row["family"] == family]
@@ -201,11 +201,11 @@ def picture(rows: list[dict]) -> Any:
         for x, y, row in front if mine[0][2]["worlds"] == 1 else ():
             if 2.0 * y < last:
                 rule = ", semi-implicit" if row.get("integrator") == "semi_implicit" else ""
-                names.append(drawing.Point(x, y, f"{row['model']}{rule}, {row['dt_ms']:g} ms", color))
+                names.append(charts.Point(x, y, f"{row['model']}{rule}, {row['dt_ms']:g} ms", color))
                 last = y
-    drawing.legend_below(figure, handles)
-    drawing.finish_layout(figure)
-    drawing.label_points(axes, names, also=also)
+    charts.legend_below(figure, handles)
+    charts.finish_layout(figure)
+    charts.label_points(axes, names, also=also)
     return figure
 
 
@@ -248,7 +248,7 @@ def main(arguments: list[str] | None = None) -> int:
         data["versions"]["exudyn"] = importlib.metadata.version("exudyn")
         print(f"wrote {runner.save(data, options.json)}")
     if options.write:
-        PICTURE.write_text(drawing.svg(picture(rows)))
+        PICTURE.write_text(charts.svg(picture(rows)))
     return 0
 
 

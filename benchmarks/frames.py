@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.trials import drawing
+from warp_spo.viewing import charts
 
 from .stress.exact import Sweep
 from .stress.scenes import far_origin
@@ -26,7 +26,7 @@ from .stress.scenes import far_origin
 DISTANCES = (0.1, 1.0, 10.0, 100.0, 1e3, 1e4, 1e5)  # of the root from the world's origin [m]
 LENGTH = 0.1  # of a link [m]
 FRAMES = {"body": "frames of the bodies", "root": "frame of the root", "world": "inertial frame"}
-COLORS = {"body": drawing.OURS, "root": drawing.LIBRARIES["torch"], "world": drawing.OTHER}
+COLORS = {"body": charts.OURS, "root": charts.LIBRARIES["torch"], "world": charts.OTHER}
 MARKS = {"body": "o", "root": "D", "world": "s"}
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE, PICTURE = DOCS / "shift_transformations.md", DOCS / "_static" / "frames.svg"
@@ -68,26 +68,26 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-@drawing.style()
+@charts.style()
 def picture(rows: list[dict[str, Any]]) -> Any:
     """Return the figure: error against distance, a panel a precision."""
-    pyplot = drawing.load_pyplot("--write")
+    pyplot = charts.load_pyplot("--write")
     figure, grid = pyplot.subplots(1, 2, figsize=(9.6, 4.4), layout="constrained", sharex=True)
     for axes, dtype in zip(grid, ("float32", "float64"), strict=True):
         mine = [row for row in rows if row["dtype"] == dtype]
         x, epsilon = [row["distance"] for row in mine], np.finfo(dtype).eps
         law = [epsilon * (at / LENGTH) ** 2 for at in x]
         shown = {name: [row[name] if row[name] < 1.0 else np.nan for row in mine] for name in FRAMES}
-        drawing.log_axis(axes.xaxis, x, drawing.power_text)
-        drawing.log_axis(axes.yaxis, [1.0, *(value for values in shown.values() for value in values if value > 0.0)],
-                         drawing.power_text)  # fmt: skip
-        axes.plot(x, law, color=drawing.FAINT, linestyle="--", linewidth=0.9, label="ε (distance / length of a link)²")
+        charts.log_axis(axes.xaxis, x, charts.power_text)
+        charts.log_axis(axes.yaxis, [1.0, *(value for values in shown.values() for value in values if value > 0.0)],
+                         charts.power_text)  # fmt: skip
+        axes.plot(x, law, color=charts.FAINT, linestyle="--", linewidth=0.9, label="ε (distance / length of a link)²")
         for name, text in FRAMES.items():
             axes.plot(x, shown[name], color=COLORS[name], marker=MARKS[name], label=text)
         axes.set(title=dtype, xlabel="distance of the robot from the origin [m]", ylabel="error of accelerations")
-    drawing.title(figure, "Digits that a frame costs")
-    drawing.legend_below(figure, grid[0].get_legend_handles_labels()[0])
-    drawing.finish_layout(figure)
+    charts.title(figure, "Digits that a frame costs")
+    charts.legend_below(figure, grid[0].get_legend_handles_labels()[0])
+    charts.finish_layout(figure)
     return figure
 
 
@@ -100,7 +100,7 @@ def main() -> None:
     if options.write:
         before, _, rest = PAGE.read_text().partition(BEGIN)
         PAGE.write_text(f"{before}{BEGIN}{table(rows)}\n{END}{rest.partition(END)[2]}")
-        PICTURE.write_text(drawing.svg(picture(rows)))
+        PICTURE.write_text(charts.svg(picture(rows)))
 
 
 if __name__ == "__main__":

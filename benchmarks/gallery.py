@@ -24,7 +24,7 @@ Every example runs as it stands, on a CPU in a minute at most, and draws its pic
 that each example printed.
 """
 SHOWN = (
-    ("A Go2 falls and stands up", "ground.svg", "python -m warp_spo go2 --ground --report report"),
+    ("A Go2 falls and stands up", "ground.png", "python -m warp_spo go2 --ground --report report"),
     (
         "A trained G1 walks",
         "films/g1_flat.webp",

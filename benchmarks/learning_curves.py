@@ -13,7 +13,7 @@ from pathlib import Path
 
 from warp_spo.env.tasks import TASKS
 from warp_spo.env.training_log import read_rows
-from warp_spo.trials.drawing import OURS, load_pyplot, style
+from warp_spo.viewing.charts import OURS, load_pyplot, style
 
 COLUMNS = 3
 

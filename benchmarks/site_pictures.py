@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_spo.trials import drawing
+from warp_spo.viewing import charts
 
 from .blocks import ROOT, STATIC
 from .stress.cases import ALLOWED
@@ -69,28 +69,28 @@ FROM_JAX = {
 
 def draw_stress(stress: list[dict]) -> Any:
     """Return the figure: a row for each family, dots for the largest errors, bars for what the laws allow."""
-    pyplot = drawing.load_pyplot("site_pictures")
+    pyplot = charts.load_pyplot("site_pictures")
     figure, axes = pyplot.subplots(1, 2, figsize=(11, 6), sharey=True, layout="constrained")
     for axis, precision in zip(axes, ("float32", "float64"), strict=True):
         for place, name in enumerate(FAMILIES):
             rows = [row for row in stress if row["case"] == name and row["precision"] == precision]
             for row in rows:
                 axis.plot(
-                    [row["law"], ALLOWED * row["law"]], [place] * 2, color=drawing.GRID, lw=7, solid_capstyle="butt"
+                    [row["law"], ALLOWED * row["law"]], [place] * 2, color=charts.GRID, lw=7, solid_capstyle="butt"
                 )
             for row in rows:
                 good = row["verdict"] == "ok"
                 axis.plot(row["max_error"], place, "o" if good else "X", ms=5 if good else 8,
-                          color=drawing.color(None) if good else drawing.INK)  # fmt: skip
+                          color=charts.color(None) if good else charts.INK)  # fmt: skip
         axis.set(xscale="log", title=precision, xlabel="error of the result, relative (of log det absolute)")
         axis.grid(axis="x")
     axes[0].set_yticks(range(len(FAMILIES)), FAMILIES.values())
     axes[0].invert_yaxis()
     handles = [
-        pyplot.Line2D([], [], marker="o", ls="", color=drawing.color(None), label="measured, within what is allowed"),
-        pyplot.Line2D([], [], marker="X", ls="", ms=8, color=drawing.INK, label="measured, beyond it"),
+        pyplot.Line2D([], [], marker="o", ls="", color=charts.color(None), label="measured, within what is allowed"),
+        pyplot.Line2D([], [], marker="X", ls="", ms=8, color=charts.INK, label="measured, beyond it"),
         pyplot.Line2D(
-            [], [], color=drawing.GRID, lw=7, label="from the expected error to ten times as much, which is allowed"
+            [], [], color=charts.GRID, lw=7, label="from the expected error to ten times as much, which is allowed"
         ),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
@@ -99,7 +99,7 @@ def draw_stress(stress: list[dict]) -> Any:
 
 def draw_host(rows: list[dict], others: list[dict]) -> Any:
     """Return the figure: a bar for each way to call forward dynamics of Go2 in 4,096 worlds, and for torch's add."""
-    pyplot = drawing.load_pyplot("site_pictures")
+    pyplot = charts.load_pyplot("site_pictures")
     times = {row["name"]: row["us"] for row in rows}
     (replayed,) = [
         row["us"]
@@ -110,7 +110,7 @@ def draw_host(rows: list[dict], others: list[dict]) -> Any:
     ]
     bars = {CALLS[name]: times[name] for name in CALLS} | {"forward_dynamics, replayed in a graph": replayed}
     figure, axis = pyplot.subplots(figsize=(8, 3), layout="constrained")
-    colors = [drawing.OTHER if "add" in name or "empty" in name else drawing.color(None) for name in bars]
+    colors = [charts.OTHER if "add" in name or "empty" in name else charts.color(None) for name in bars]
     axis.barh(list(bars), list(bars.values()), color=colors)
     axis.invert_yaxis()
     axis.bar_label(axis.containers[0], [f" {value:.3g}" for value in bars.values()])
@@ -127,12 +127,12 @@ def rows_of_files(kind: str) -> list[list[float]]:
 
 def draw_files() -> Any:
     """Return the figure: errors of scenes from robot files, and those of accelerations over the condition number."""
-    pyplot = drawing.load_pyplot("site_pictures")
+    pyplot = charts.load_pyplot("site_pictures")
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(10.4, 4.6), layout="constrained")
     handles = []
     for kind, (name, marker, peer) in READERS.items():
         mass, bias, acceleration, condition = np.array(rows_of_files(kind)).T
-        color = drawing.color(peer)
+        color = charts.color(peer)
         for values, line, what in ((mass, "-", "mass matrix"), (bias, "--", "bias force")):
             values = np.maximum(np.sort(values), LEAST)
             share = 100.0 * np.arange(1, len(values) + 1) / len(values)
@@ -142,42 +142,42 @@ def draw_files() -> Any:
         right.plot(condition[known], acceleration[known], marker, color=color, ms=5)
         handles.append(pyplot.Line2D([], [], color=color, marker=marker, ls="", label=f"{kind.upper()} beside {name}"))
     conditions = np.array([3.0, 1e9])
-    right.plot(conditions, np.finfo(float).eps * conditions, color=drawing.FAINT, lw=1)
-    right.text(2e6, 1e-9, "rounding times\ncondition", color=drawing.FAINT, ha="right")
+    right.plot(conditions, np.finfo(float).eps * conditions, color=charts.FAINT, lw=1)
+    right.text(2e6, 1e-9, "rounding times\ncondition", color=charts.FAINT, ha="right")
     left.annotate("quarter turns with ten digits\nare exactly quarter turns here", (2e-13, 86), (1.5e-15, 30),
-                  color=drawing.FAINT, arrowprops=dict(arrowstyle="-", color=drawing.FAINT, lw=0.8))  # fmt: skip
-    drawing.log_axis(left.xaxis, [LEAST, 1e-11], drawing.power_text)
-    drawing.log_axis(right.xaxis, [3.0, 1e9], drawing.power_text)
-    drawing.log_axis(right.yaxis, [1e-16, 1e-8], drawing.power_text)
+                  color=charts.FAINT, arrowprops=dict(arrowstyle="-", color=charts.FAINT, lw=0.8))  # fmt: skip
+    charts.log_axis(left.xaxis, [LEAST, 1e-11], charts.power_text)
+    charts.log_axis(right.xaxis, [3.0, 1e9], charts.power_text)
+    charts.log_axis(right.yaxis, [1e-16, 1e-8], charts.power_text)
     left.set(title="Files with an error below …", xlabel="error, relative", ylabel="% of the files")
     right.set(title="Accelerations", xlabel="condition of the mass matrix", ylabel="error, relative")
-    drawing.legend_below(figure, handles)
+    charts.legend_below(figure, handles)
     return figure
 
 
 def draw_gpus(runs: list[dict]) -> Any:
     """Return the figure: what processes share and exchange, and env-steps/s on one GPU and on several."""
-    pyplot = drawing.load_pyplot("site_pictures")
+    pyplot = charts.load_pyplot("site_pictures")
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(10.4, 3.6), layout="constrained", width_ratios=(1.6, 1.0))
     left.set(xlim=(0.0, 10.0), ylim=(0.6, 6.0), title="What two processes exchange")
     left.axis("off")
     for process, (x, worlds) in enumerate(((0.1, "0 to 2047"), (5.6, "2048 to 4095"))):
-        for y, text, face in ((3.9, f"GPU {process}: worlds {worlds}", drawing.OURS), (1.5, "policy", "white")):
-            left.add_patch(pyplot.Rectangle((x, y), 4.3, 1.3, facecolor=face, edgecolor=drawing.INK, lw=1.0))
-            color = "white" if face != "white" else drawing.INK
+        for y, text, face in ((3.9, f"GPU {process}: worlds {worlds}", charts.OURS), (1.5, "policy", "white")):
+            left.add_patch(pyplot.Rectangle((x, y), 4.3, 1.3, facecolor=face, edgecolor=charts.INK, lw=1.0))
+            color = "white" if face != "white" else charts.INK
             left.text(x + 2.15, y + 0.65, text, ha="center", va="center", color=color)
         for shift, ends in ((1.3, (2.8, 3.9)), (3.0, (3.9, 2.8))):
             left.annotate("", (x + shift, ends[1]), (x + shift, ends[0]), arrowprops=dict(arrowstyle="->", lw=1.0))
-        left.text(x + 1.15, 3.3, "actions", ha="right", va="center", color=drawing.FAINT)
-        left.text(x + 3.15, 3.3, "observations", va="center", color=drawing.FAINT, fontsize=8)
-        left.text(x + 2.15, 5.45, f"process {process}", ha="center", color=drawing.FAINT)
+        left.text(x + 1.15, 3.3, "actions", ha="right", va="center", color=charts.FAINT)
+        left.text(x + 3.15, 3.3, "observations", va="center", color=charts.FAINT, fontsize=8)
+        left.text(x + 2.15, 5.45, f"process {process}", ha="center", color=charts.FAINT)
     left.annotate("", (5.6, 2.15), (4.4, 2.15), arrowprops=dict(arrowstyle="<->", lw=1.4))
-    left.text(5.0, 1.05, "gradients, once for each update of the policy", ha="center", color=drawing.FAINT)
-    left.text(5.0, 4.55, "nothing", ha="center", va="center", color=drawing.FAINT, fontsize=8)
+    left.text(5.0, 1.05, "gradients, once for each update of the policy", ha="center", color=charts.FAINT)
+    left.text(5.0, 4.55, "nothing", ha="center", va="center", color=charts.FAINT, fontsize=8)
     bars = {1: [runs[0]["alone"]]} | {len(run["together"]): run["together"] for run in runs}
     for place, parts in enumerate(bars.values()):
         for number, part in enumerate(parts):
-            right.barh(place, 1e-6 * part, 0.5, left=1e-6 * sum(parts[:number]), color=drawing.OURS, edgecolor="white")
+            right.barh(place, 1e-6 * part, 0.5, left=1e-6 * sum(parts[:number]), color=charts.OURS, edgecolor="white")
         right.text(1e-6 * sum(parts), place, f" {1e-6 * sum(parts):.0f}", va="center")
     right.set_yticks(range(len(bars)), [f"{count} GPU" + "s" * (count > 1) for count in bars])
     right.invert_yaxis()
@@ -188,10 +188,10 @@ def draw_gpus(runs: list[dict]) -> Any:
 
 def draw_jax(rows: list[dict]) -> Any:
     """Return the figure: a bar for each way to call an operation from JAX."""
-    pyplot = drawing.load_pyplot("site_pictures")
+    pyplot = charts.load_pyplot("site_pictures")
     times = {row["name"]: row["done_us"] for row in rows}
     figure, axis = pyplot.subplots(figsize=(8, 3.4), layout="constrained")
-    strong = [drawing.color(None) if "jit" in name else drawing.OTHER for name in FROM_JAX]
+    strong = [charts.color(None) if "jit" in name else charts.OTHER for name in FROM_JAX]
     axis.barh(list(FROM_JAX.values()), [times[name] for name in FROM_JAX], color=strong)
     axis.invert_yaxis()
     axis.bar_label(axis.containers[0], [f" {times[name]:.0f}" for name in FROM_JAX])
@@ -205,12 +205,12 @@ def main() -> None:
     found = gather(read(file) for file in files([RESULTS]))[0]  # the newest rows of each kind on a GPU
     groups = {group: [row for row in found.capabilities if row["group"].startswith(group)] for group in (HOST, JAX)}
     runs = [json.loads(file.read_text())["row"] for file in sorted(RESULTS.glob("contact/*-environments.json"))]
-    with drawing.style():
-        (STATIC / "jax.svg").write_text(drawing.svg(draw_jax(groups[JAX])))
-        (STATIC / "many_gpus.svg").write_text(drawing.svg(draw_gpus(runs)))
-        (STATIC / "robot_files.svg").write_text(drawing.svg(draw_files()))
-        (STATIC / "stress.svg").write_text(drawing.svg(draw_stress(found.stress)))
-        (STATIC / "host.svg").write_text(drawing.svg(draw_host(groups[HOST], found.rows)))
+    with charts.style():
+        (STATIC / "jax.svg").write_text(charts.svg(draw_jax(groups[JAX])))
+        (STATIC / "many_gpus.svg").write_text(charts.svg(draw_gpus(runs)))
+        (STATIC / "robot_files.svg").write_text(charts.svg(draw_files()))
+        (STATIC / "stress.svg").write_text(charts.svg(draw_stress(found.stress)))
+        (STATIC / "host.svg").write_text(charts.svg(draw_host(groups[HOST], found.rows)))
 
 
 if __name__ == "__main__":

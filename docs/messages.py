@@ -16,6 +16,7 @@ ROOMS = {
     "torch": "torch",
     "jax": "JAX",
     "env": "Environments and training",
+    "viewing": "Films and pictures",
     "graph": "Trees and operators",
     "hinges": "Hinges and custom joints",
 }

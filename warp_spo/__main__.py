@@ -35,15 +35,16 @@ from .dynamics.dynamics import MOST_WORLDS, Dynamics
 from .dynamics.dynamics import OPERATIONS as DECLARED
 from .dynamics.operation import AS_WRITTEN
 from .scene.scene import Scene
-from .trials import drawing, film, report
+from .trials import drop_test, report
 from .trials.inputs import OPERATIONS, TOLERANCE, Inputs, Operation
 from .trials.memory import check_memory
 from .trials.trial import SAMPLE, Subject, Trial
+from .viewing import charts, films
 
 WORLDS = {False: 1024, True: 4096}  # on a CPU, on a GPU
 WARM_UP, BUDGET = 0.05, 0.3  # [s] for each operation, so that all together take less than a minute
 SETS = {False: 1, True: 4}  # sets of inputs on a CPU, on a GPU; one graph evaluates them in turn
-REPORT, STRIP = "report.html", "ground.svg"
+REPORT, STRIP = "report.html", "ground.png"
 FALLING = ("ant", "go2", "g1")  # robots of --ground
 CLOSED = ("forward_dynamics", "step")  # by either way they obey the loops, which the open tree does not
 
@@ -69,7 +70,7 @@ def parser() -> Parser:
         "--ground",
         nargs="?",
         const="flat",
-        choices=film.GROUNDS,
+        choices=drop_test.GROUNDS,
         help="let the robot fall onto flat ground, or rough ground or stairs, and print what happens",
     )
     p.add_argument("--report", type=Path, metavar="DIR", help=f"folder for {REPORT}, with the table and a picture")
@@ -85,11 +86,11 @@ def main(argv: list[str] | None = None) -> int:
     options = parser().parse_args(argv)
     wp.config.log_level = wp.LOG_WARNING  # before newton is imported
     try:
-        pyplot: Any = drawing.load_pyplot() if options.report else None
+        pyplot: Any = charts.load_pyplot() if options.report else None
         if options.report:
             _make_folder(options.report)
         if options.ground:
-            return run_on_ground(options, pyplot)
+            return run_on_ground(options)
         scene = load(options.robot)
         device = find_device(options.device)
         worlds = options.worlds if options.worlds is not None else WORLDS[device.is_cuda]
@@ -150,7 +151,7 @@ def write_page(path: Path, pyplot: Any, title: str, rows: list[dict], words: lis
     return path
 
 
-def run_on_ground(options: argparse.Namespace, pyplot: Any) -> int:
+def run_on_ground(options: argparse.Namespace) -> int:
     """Let a robot fall onto the ground, print a table, draw the film strip, and return the exit code.
 
     Raises:
@@ -163,14 +164,15 @@ def run_on_ground(options: argparse.Namespace, pyplot: Any) -> int:
     if options.worlds is not None:
         raise ValueError("--worlds with --ground; expected one of them: a single robot falls")
     device = find_device(options.device)
-    robot = robots.load(options.robot, film.make_ground(options.ground))
-    title = f"{options.robot} falls {film.FALL} m onto {options.ground} ground, in steps of {1e3 * film.DT:g} ms"
-    frames = film.film(robot, device)
-    print(title, *film.table(frames), sep="\n")
+    robot = robots.load(options.robot, drop_test.make_ground(options.ground))
+    title = (
+        f"{options.robot} falls {drop_test.FALL} m onto {options.ground} ground, in steps of {1e3 * drop_test.DT:g} ms"
+    )
+    frames = drop_test.drop(robot, device)
+    print(title, *drop_test.table(frames), sep="\n")
     if options.report:
-        figure, path = film.strip(pyplot, title, robot, frames), options.report / STRIP
-        path.write_text(drawing.svg(figure))
-        pyplot.close(figure)
+        strip = drop_test.draw(robot, frames, device)
+        path = films.save_strip(strip, options.report / STRIP, len(strip), gap=6)
         print(f"wrote {path}")
     lost = not all(np.isfinite(frame.poses).all() for frame in frames)
     if lost:

@@ -7,7 +7,7 @@
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --mujoco         # 64 robots walk in MuJoCo; no film
 
 With ``--export`` or ``--mujoco`` a film is drawn only where ``--film`` or ``--view`` asks for it.
-Films are drawn without a display: by MuJoCo's renderer and EGL where both are at hand, else in NumPy.
+Films are drawn without a display, on the device of the environment.
 """
 
 from __future__ import annotations
@@ -39,7 +39,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--trial", help="of go2-rough: on the ground of one of its trials")
     parser.add_argument("--out", type=Path, help="name of the film; left out: that of the checkpoint")
     parser.add_argument("--film", choices=("gif", "webp", "mp4"), help="gif unless told; mp4 needs imageio-ffmpeg")
-    parser.add_argument("--renderer", choices=("mujoco", "numpy"), help="left out: MuJoCo's where it works")
     parser.add_argument("--measure", action="store_true", help="print what the task asks for, over --worlds worlds")
     parser.add_argument("--worlds", type=count, default=256)
     parser.add_argument("--view", action="store_true", help="show Newton's viewer")
@@ -48,7 +47,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
 
     learning = load_learning(parser)
-    from .env import export, film, recording
+    from .env import export, recording
+    from .viewing import films
 
     chosen = task(options.task)
     worlds = options.worlds if options.measure else 1
@@ -77,10 +77,10 @@ def main(arguments: list[str] | None = None) -> int:
     recorded = recording.record(env, policy, options.seconds, options.command)
     if options.view:
         recording.show(chosen.ROBOT, recorded, env.step_dt)
-    frames = recording.film(chosen, recorded, recording.STEPS_A_PICTURE, options.renderer)
-    print(film.save(frames, name.with_suffix(f".{options.film or 'gif'}"), recording.STEPS_A_PICTURE * env.step_dt))
-    strip = recording.strip(chosen, recorded, renderer=options.renderer)
-    print(film.save_strip(strip, name.with_suffix(".png")))
+    frames = recording.film(chosen, recorded, recording.STEPS_A_PICTURE)
+    print(films.save(frames, name.with_suffix(f".{options.film or 'gif'}"), recording.STEPS_A_PICTURE * env.step_dt))
+    strip = recording.strip(chosen, recorded)
+    print(films.save_strip(strip, name.with_suffix(".png")))
     return 0
 
 

@@ -24,7 +24,7 @@ import warp_spo as spo
 from warp_spo.dynamics.operation import derivative_of
 from warp_spo.dynamics.stepping.step import STEP
 from warp_spo.scene.contacts import HEIGHTS
-from warp_spo.trials.drawing import OTHER, OURS
+from warp_spo.viewing.charts import OTHER, OURS
 
 from ..capabilities import SETS, measure_time
 from . import scenes

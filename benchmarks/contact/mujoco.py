@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.trials import drawing
+from warp_spo.viewing import charts
 
 from ..table import robots
 from .motions import BENT
@@ -201,29 +201,29 @@ def measure() -> dict[str, Any]:
 
 def draw(found: dict[str, Any], path: Path) -> None:
     """Draw error against run time, a line for each method."""
-    pyplot = drawing.load_pyplot("--picture")
+    pyplot = charts.load_pyplot("--picture")
     rows = [row for row in found["rows"] if row["method"] not in ("warp_spo, 1 passes", "warp_spo, 4 passes")]
-    with drawing.style():
+    with charts.style():
         figure, axes = pyplot.subplots(figsize=(7.2, 4.2))
-        drawing.log_axis(axes.xaxis, [1e6 * row["seconds"] for row in rows], drawing.time_text)
-        drawing.log_axis(axes.yaxis, [row["error"] for row in rows], drawing.power_text)
+        charts.log_axis(axes.xaxis, [1e6 * row["seconds"] for row in rows], charts.time_text)
+        charts.log_axis(axes.yaxis, [row["error"] for row in rows], charts.power_text)
         points = []
         for method in dict.fromkeys(row["method"] for row in rows):
             line = [row for row in rows if row["method"] == method]
             peer = None if method.startswith("warp_spo") else "MuJoCo C"
-            hue = drawing.OURS_DARK if method == "warp_spo, 2 passes" else drawing.color(peer)
+            hue = charts.OURS_DARK if method == "warp_spo, 2 passes" else charts.color(peer)
             x, y = [1e6 * row["seconds"] for row in line], [row["error"] for row in line]
             dashes = "--" if method.endswith("default") else "-"
             axes.plot(x, y, dashes, color=hue, marker="o", markersize=4, label=method)
             names = [f"{1e3 * row['dt']:g} ms" for row in line]
-            points += [drawing.Point(*place, hue) for place in zip(x, y, names, strict=True)]
+            points += [charts.Point(*place, hue) for place in zip(x, y, names, strict=True)]
         axes.set(xlabel="run time of a simulated second of one robot, one CPU core", ylabel="error of the base [mm]")
         axes.set_title("G1 pushed by 4 N s: error against its own run at 0.1 ms")
         axes.legend(loc="upper right")
         figure.tight_layout()
         figure.canvas.draw()
-        drawing.label_points(axes, points, 7.5)
-    path.write_text(drawing.svg(figure))
+        charts.label_points(axes, points, 7.5)
+    path.write_text(charts.svg(figure))
     pyplot.close(figure)
 
 

@@ -13,17 +13,17 @@ import numpy as np
 
 import warp_spo as spo
 from warp_spo.scene import terrain
-from warp_spo.trials import drawing
+from warp_spo.viewing import charts
 
 DIFFICULTY, SEED = 0.8, 3
-LOW, HIGH = "#aeb8c2", drawing.OURS  # colours of the lowest and the highest point
+LOW, HIGH = "#aeb8c2", charts.OURS  # colours of the lowest and the highest point
 LIGHT = (315.0, 45.0)  # azimuth and altitude of the light [deg]
 
 
-@drawing.style()
+@charts.style()
 def picture(path: Path) -> None:
     """Draw a panel for each kind into a PNG file."""
-    pyplot = drawing.load_pyplot("benchmarks.contact.terrain")
+    pyplot = charts.load_pyplot("benchmarks.contact.terrain")
     figure = pyplot.figure(figsize=(11.0, 5.2))
     figure.subplots_adjust(left=0.0, right=1.0, bottom=0.0, top=0.94, wspace=0.0, hspace=0.02)
     for number, (name, kind) in enumerate(terrain.KINDS.items()):

@@ -1,6 +1,6 @@
 """Pictures of the rows: error against run time, and run time against size.
 
-Colours are libraries and markers are precisions, see :mod:`warp_spo.trials.drawing`.
+Colours are libraries and markers are precisions, see :mod:`warp_spo.viewing.charts`.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from warp_spo.trials import drawing
-from warp_spo.trials.drawing import Point
+from warp_spo.viewing import charts
+from warp_spo.viewing.charts import Point
 
 from .evidence import Evidence, usual_worlds
 
@@ -44,7 +44,7 @@ def pareto(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 # -- error against run time --------------------------------------------------------------------------------------------
-@drawing.style()
+@charts.style()
 def headline(pyplot: Any, evidence: Evidence) -> Any:
     """Draw error against run time of forward dynamics on three robots: ours, and the fastest variant of each library.
 
@@ -62,15 +62,15 @@ def headline(pyplot: Any, evidence: Evidence) -> Any:
     figure, grid = pyplot.subplots(1, len(robots), figsize=(10.4, 4.9), layout="constrained", squeeze=False)
     for axes, robot in zip(grid[0], robots, strict=True):
         mine = [row for row in rows if row["scene"] == robot]
-        drawing.log_axis(axes.xaxis, [row["us"] for row in rows], drawing.time_text)
-        drawing.log_axis(axes.yaxis, [row["error"] for row in rows], drawing.power_text, most=5)
+        charts.log_axis(axes.xaxis, [row["us"] for row in rows], charts.time_text)
+        charts.log_axis(axes.yaxis, [row["error"] for row in rows], charts.power_text, most=5)
         axes.set(title=_title(mine[0]), xlabel=f"run time of all {worlds:,} robots")
         axes.label_outer()
     grid[0][0].set_ylabel("largest relative error")
     device = evidence.machine["device"]
-    drawing.title(figure, f"Forward dynamics of {worlds:,} robots at once, {device}: lower left is better")
+    charts.title(figure, f"Forward dynamics of {worlds:,} robots at once, {device}: lower left is better")
     _legend(figure, rows)
-    drawing.finish_layout(figure)
+    charts.finish_layout(figure)
     for axes, robot in zip(grid[0], robots, strict=True):
         mine = [row for row in rows if row["scene"] == robot]
         _speedup(axes, mine)
@@ -99,7 +99,7 @@ def _library_name(row: dict) -> str:
     if not row.get("peer"):
         return "warp_spo"
     solver = next((name for name in ("Featherstone", "Steel") if name in row.get("variant", "")), "")
-    library = drawing.library(row["peer"])
+    library = charts.library(row["peer"])
     note = " (CPU)" if library in ON_CPU else " (solve only)" if library in SOLVE_ONLY else ""
     return f"{library} {solver}".strip() + note
 
@@ -108,13 +108,13 @@ def _points(axes: Any, rows: Sequence[dict], names: Sequence[str]) -> None:
     """Draw a marker a row, ours larger and in front, and its name."""
     points = []
     for row, name in zip(rows, names, strict=True):
-        ours, color = not row.get("peer"), drawing.color(row.get("peer"))
-        size, marker = (8.5 if ours else 5.5), drawing.MARKERS.get(row["dtype"], "v")
+        ours, color = not row.get("peer"), charts.color(row.get("peer"))
+        size, marker = (8.5 if ours else 5.5), charts.MARKERS.get(row["dtype"], "v")
         axes.plot(_range(row), [row["error"]] * 2, color=color, linewidth=1.0, alpha=0.6, zorder=2)
         axes.plot(row["us"], row["error"], marker, color=color, markersize=size, linestyle="",
                   markeredgecolor="white", markeredgewidth=0.6, zorder=4 if ours else 3)  # fmt: skip
         points.append(Point(row["us"], row["error"], name, color, bold=ours))
-    drawing.label_points(axes, points)
+    charts.label_points(axes, points)
 
 
 def _range(row: dict) -> tuple[float, float]:
@@ -126,42 +126,40 @@ def _speedup(axes: Any, rows: Sequence[dict]) -> None:
     """Draw an arrow from ours to the fastest peer that does the same work in float32, and the ratio of their times."""
     ours = next((row for row in rows if not row.get("peer") and row["dtype"] == "float32"), None)
     peers = [row for row in rows if row.get("peer") and row["dtype"] == "float32"]
-    peers = [row for row in peers if drawing.library(row["peer"]) not in SOLVE_ONLY]
+    peers = [row for row in peers if charts.library(row["peer"]) not in SOLVE_ONLY]
     if not ours or not peers:
         return
     other = min(peers, key=lambda row: row["us"])
     y = ours["error"] * 1e-2
-    ends = dict(arrowprops=dict(arrowstyle="<->", color=drawing.OURS, linewidth=1.4, shrinkA=0, shrinkB=0))
+    ends = dict(arrowprops=dict(arrowstyle="<->", color=charts.OURS, linewidth=1.4, shrinkA=0, shrinkB=0))
     axes.annotate("", (ours["us"], y), (other["us"], y), in_layout=False, **ends)
     text = f"{other['us'] / ours['us']:.0f} × faster than {_library_name(other)}"
     axes.annotate(text, (ours["us"], y), xytext=(0, -5), textcoords="offset points", ha="left", va="top",
-                  color=drawing.OURS, fontweight="bold", fontsize=10.5, in_layout=False)  # fmt: skip
+                  color=charts.OURS, fontweight="bold", fontsize=10.5, in_layout=False)  # fmt: skip
 
 
 def _legend(figure: Any, rows: Sequence[dict]) -> None:
     """Put a legend below the panels: a colour a library, a marker a precision."""
     from matplotlib.lines import Line2D
 
-    peers = {drawing.library(row["peer"]): row["peer"] for row in rows if row.get("peer")}
+    peers = {charts.library(row["peer"]): row["peer"] for row in rows if row.get("peer")}
     names = {"warp_spo": None} if any(not row.get("peer") for row in rows) else {}
     handles = []
     for name, peer in [*names.items(), *sorted(peers.items(), key=lambda each: each[0].lower())]:
         size = 5.5 if peer else 8.5
         label = peer.removeprefix("dense resolvent in ") if peer else name
-        handles.append(
-            Line2D([], [], marker="o", linestyle="", color=drawing.color(peer), markersize=size, label=label)
-        )
+        handles.append(Line2D([], [], marker="o", linestyle="", color=charts.color(peer), markersize=size, label=label))
     found = {row["dtype"] for row in rows}
-    for dtype in [*drawing.MARKERS, *sorted(found - drawing.MARKERS.keys())]:
+    for dtype in [*charts.MARKERS, *sorted(found - charts.MARKERS.keys())]:
         if dtype in found:
-            label, marker = drawing.PRECISIONS.get(dtype, dtype), drawing.MARKERS.get(dtype, "v")
-            handles.append(Line2D([], [], marker=marker, linestyle="", color=drawing.FAINT, label=label))
-    handles.append(Line2D([], [], color=drawing.FAINT, linewidth=1.0, alpha=0.6, marker="|", label=RANGE))
-    drawing.legend_below(figure, handles)
+            label, marker = charts.PRECISIONS.get(dtype, dtype), charts.MARKERS.get(dtype, "v")
+            handles.append(Line2D([], [], marker=marker, linestyle="", color=charts.FAINT, label=label))
+    handles.append(Line2D([], [], color=charts.FAINT, linewidth=1.0, alpha=0.6, marker="|", label=RANGE))
+    charts.legend_below(figure, handles)
 
 
 # -- run time against size ---------------------------------------------------------------------------------------------
-@drawing.style()
+@charts.style()
 def scaling(pyplot: Any, evidence: Evidence) -> Any:
     """Draw our run time against what grows, a panel a sweep.
 
@@ -181,21 +179,21 @@ def scaling(pyplot: Any, evidence: Evidence) -> Any:
     names = []
     for axes, name in zip(grid.flat, panels, strict=False):
         names.append((axes, _sweep(axes, name, [row for row in swept if row["sweep"] == name])))
-    drawing.title(figure, f"Run time against size in float32, {evidence.machine['device']}: lower is better")
-    handles = [Line2D([], [], color=drawing.OURS, linestyle=_dashes(op), marker=".", linewidth=1.6, label=op)
+    charts.title(figure, f"Run time against size in float32, {evidence.machine['device']}: lower is better")
+    handles = [Line2D([], [], color=charts.OURS, linestyle=_dashes(op), marker=".", linewidth=1.6, label=op)
                for op in dict.fromkeys(row["op"] for row in swept)]  # fmt: skip
-    handles.append(Line2D([], [], color=drawing.FAINT, linestyle=":", linewidth=1.0, label=GUIDE))
-    handles.append(Line2D([], [], color=drawing.OURS, linewidth=THICK, alpha=0.4, label=RANGE))
+    handles.append(Line2D([], [], color=charts.FAINT, linestyle=":", linewidth=1.0, label=GUIDE))
+    handles.append(Line2D([], [], color=charts.OURS, linewidth=THICK, alpha=0.4, label=RANGE))
     free = list(grid.flat)[len(panels) :]
     for axes in free:
         axes.axis("off")
     if free:
         free[0].legend(handles=handles, loc="center left")
     else:
-        drawing.legend_below(figure, handles)
-    drawing.finish_layout(figure)
+        charts.legend_below(figure, handles)
+    charts.finish_layout(figure)
     for axes, points in names:
-        drawing.label_points(
+        charts.label_points(
             axes, points, also=[place for line in axes.lines for place in _along(line) if line.get_linewidth() < THICK]
         )
     return figure
@@ -206,7 +204,7 @@ def _sweep(axes: Any, name: str, rows: Sequence[dict]) -> list[Point]:
     _, label, title = PANELS[name]
     scenes = list(dict.fromkeys(row["scene"] for row in rows)) if name == "worlds" else [""]
     ends = []
-    for scene, color in zip(scenes, (drawing.OURS, drawing.OURS_DARK), strict=False):
+    for scene, color in zip(scenes, (charts.OURS, charts.OURS_DARK), strict=False):
         for op in dict.fromkeys(row["op"] for row in rows):
             mine = [row for row in rows if row["op"] == op and scene in ("", row["scene"])]
             points = sorted((_size(row, name), row["us"]) for row in mine)
@@ -216,12 +214,12 @@ def _sweep(axes: Any, name: str, rows: Sequence[dict]) -> list[Point]:
             if scene and op == MAIN:
                 ends.append(Point(*points[min(2, len(points) - 1)], _title(mine[0]), color))
     sizes, times = [_size(row, name) for row in rows], [row["us"] for row in rows]
-    drawing.log_axis(axes.xaxis, sizes, drawing.count_text, most=4)
-    drawing.log_axis(axes.yaxis, times, drawing.time_text, most=4)
+    charts.log_axis(axes.xaxis, sizes, charts.count_text, most=4)
+    charts.log_axis(axes.yaxis, times, charts.time_text, most=4)
     if name != "branching":
         top = max(row["us"] for row in rows if _size(row, name) == max(sizes))
         low = min(sizes) / max(sizes)
-        axes.plot([low * max(sizes), max(sizes)], [low * top, top], ":", color=drawing.FAINT, linewidth=1.0, zorder=1)
+        axes.plot([low * max(sizes), max(sizes)], [low * top, top], ":", color=charts.FAINT, linewidth=1.0, zorder=1)
     axes.set(title=title, ylabel="run time of all worlds")
     axes.set_xlabel(label if name == "worlds" else f"{label}, {rows[0]['worlds']:,} worlds")
     return ends

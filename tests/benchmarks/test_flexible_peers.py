@@ -8,7 +8,7 @@ import pytest
 from benchmarks import boom, flexible_peers
 from benchmarks.table import evidence
 from support.rendering import assert_is_whole
-from warp_spo.trials import drawing
+from warp_spo.viewing import charts
 
 PAGE = evidence.ROOT / "docs" / "flexible.md"
 ROUNDED = 2e-2  # of an error: the file keeps places of the tip to 1 um, and compilers differ in rounding
@@ -71,7 +71,7 @@ def test_steps_divide_the_time_between_two_places_of_the_tip():
 
 
 def test_the_picture_has_all_families_and_is_committed(rows):
-    text, committed = drawing.svg(flexible_peers.picture(rows)), flexible_peers.PICTURE.read_text()
+    text, committed = charts.svg(flexible_peers.picture(rows)), flexible_peers.PICTURE.read_text()
     assert_is_whole(text)
     assert_is_whole(committed)
     for family in flexible_peers.FAMILIES:

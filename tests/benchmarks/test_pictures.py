@@ -7,7 +7,8 @@ import pytest
 from benchmarks import peers
 from benchmarks.table import evidence, pictures, table
 from support.rendering import assert_is_whole
-from warp_spo.trials import drawing, report
+from warp_spo.trials import report
+from warp_spo.viewing import charts
 
 RESULTS = evidence.RESULTS
 TOLERANCE = {"float32": 1e-4, "float64": 1e-10}
@@ -16,7 +17,7 @@ TITLE = "robot: 3 bodies, 4 dof, 64 worlds on cpu"
 
 @pytest.fixture(scope="module")
 def pyplot():
-    return drawing.load_pyplot()
+    return charts.load_pyplot()
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +46,7 @@ def test_all_pictures_of_the_results_are_committed(machines, pyplot):
     """Each as it is drawn from the results: its size and its texts."""
     for name, draw in zip(table.PICTURES, (pictures.headline, pictures.scaling), strict=True):
         figure = draw(pyplot, machines[0])
-        text, committed = drawing.svg(figure), (RESULTS / name).read_text()
+        text, committed = charts.svg(figure), (RESULTS / name).read_text()
         pyplot.close(figure)
         assert re.search('viewBox="(.*?)"', text)[1] == re.search('viewBox="(.*?)"', committed)[1]
         assert written(text) == written(committed), f"{name}: draw it again with python -m benchmarks --readme"
@@ -59,8 +60,8 @@ def test_error_against_run_time_names_all_libraries_and_precisions(machines, pyp
     assert {"warp_spo", "float32", "float64"} <= set(names)
     if found.is_gpu:
         of = [row for row in found.peers if row["op"] == "mass_matrix"]
-        assert of and all(any(drawing.library(row["peer"]) in name for name in names) for row in of)
-    assert_is_whole(drawing.svg(figure))
+        assert of and all(any(charts.library(row["peer"]) in name for name in names) for row in of)
+    assert_is_whole(charts.svg(figure))
     pyplot.close(figure)
 
 
@@ -68,7 +69,7 @@ def test_error_against_run_time_names_all_libraries_and_precisions(machines, pyp
 def test_run_time_against_size_names_its_lines(machines, pyplot, machine):
     figure = pictures.scaling(pyplot, machines[machine])
     assert legends(figure) == ["forward_dynamics", "inverse_dynamics", pictures.GUIDE, pictures.RANGE]
-    svg = drawing.svg(figure)
+    svg = charts.svg(figure)
     assert {"Arm, 7 dof", "Humanoid, 27 dof", "Chain", "Random tree"} <= written(svg)
     assert_is_whole(svg)
     pyplot.close(figure)
@@ -84,7 +85,7 @@ def _rows(dtypes, errors=(3e-8, 0.0, float("nan"), 2.0)):
 @pytest.mark.parametrize("dtypes", [("float32",), ("float32", "float64")])
 def test_picture_of_the_main_job_names_every_operation(pyplot, dtypes):
     figure = report.picture(pyplot, TITLE, _rows(dtypes), TOLERANCE)
-    svg = drawing.svg(figure)
+    svg = charts.svg(figure)
     assert legends(figure) == [*(f"warp_spo, {dtype}" for dtype in dtypes), "beyond the tolerance", report.BARS]
     assert {"phi", "mass_matrix", "forward_dynamics", f"{TITLE}: lower left is better"} <= written(svg)
     assert "float32, tolerance 10⁻⁴, 1 without a result" in written(svg)
@@ -97,32 +98,32 @@ def test_a_picture_of_one_point_or_none_is_whole(pyplot):
         rows = [dict(op="phi", dtype="float32", seconds=1e-5, range=(1e-5, 1e-5), error=error, least=error)
                 for error in errors]  # fmt: skip
         figure = report.picture(pyplot, TITLE, rows, TOLERANCE)
-        assert_is_whole(drawing.svg(figure))
+        assert_is_whole(charts.svg(figure))
         pyplot.close(figure)
 
 
 def test_every_library_has_a_colour_of_its_own():
-    colors = [drawing.OURS, drawing.OTHER, *drawing.LIBRARIES.values()]
-    assert len(set(colors)) == len(colors) and len(drawing.LIBRARIES) == len(peers.PEERS) - 1  # two peers are torch's
-    assert drawing.color("dense resolvent in torch 2.11") == drawing.color("torch 2.13") != drawing.color("P 1")
-    assert drawing.color(None) == drawing.OURS
+    colors = [charts.OURS, charts.OTHER, *charts.LIBRARIES.values()]
+    assert len(set(colors)) == len(colors) and len(charts.LIBRARIES) == len(peers.PEERS) - 1  # two peers are torch's
+    assert charts.color("dense resolvent in torch 2.11") == charts.color("torch 2.13") != charts.color("P 1")
+    assert charts.color(None) == charts.OURS
 
 
 def test_axes_have_plain_numbers():
-    assert [drawing.time_text(us) for us in (0.5, 20.0, 1e3, 3e5, 2e6)] == ["0.5 µs", "20 µs", "1 ms", "300 ms", "2 s"]
-    assert [drawing.power_text(error) for error in (1e-7, 3e-15, 1.0)] == ["10⁻⁷", "3×10⁻¹⁵", "10⁰"]
-    assert [drawing.count_text(n) for n in (1, 100, 1e3, 1e6)] == ["1", "100", "1k", "1M"]
+    assert [charts.time_text(us) for us in (0.5, 20.0, 1e3, 3e5, 2e6)] == ["0.5 µs", "20 µs", "1 ms", "300 ms", "2 s"]
+    assert [charts.power_text(error) for error in (1e-7, 3e-15, 1.0)] == ["10⁻⁷", "3×10⁻¹⁵", "10⁰"]
+    assert [charts.count_text(n) for n in (1, 100, 1e3, 1e6)] == ["1", "100", "1k", "1M"]
 
 
 @pytest.mark.parametrize("ends", [(72.0, 95.0), (1.0, 9.0), (30.0, 200.0), (1e-7, 4e-7), (3.0, 3e4), (1.0, 1e9)])
 def test_labels_of_ticks_do_not_touch(pyplot, ends):
     """On axes of less than a decade, too, and at least one is there."""
-    with drawing.style():
+    with charts.style():
         figure, grid = pyplot.subplots(2, 3, figsize=(10.4, 6.0), layout="constrained")
     for axes in grid.flat:
-        drawing.log_axis(axes.xaxis, ends, drawing.time_text)
-        drawing.log_axis(axes.yaxis, ends, drawing.power_text)
-    drawing.finish_layout(figure)
+        charts.log_axis(axes.xaxis, ends, charts.time_text)
+        charts.log_axis(axes.yaxis, ends, charts.power_text)
+    charts.finish_layout(figure)
     renderer = figure.canvas.get_renderer()
     for axis in (grid[0][1].xaxis, grid[0][1].yaxis):
         low, high = sorted(axis.get_view_interval())
@@ -135,13 +136,13 @@ def test_labels_of_ticks_do_not_touch(pyplot, ends):
 
 def test_names_do_not_hide_each_other(pyplot):
     """Twelve points close together: all names are inside the panel and no two overlap."""
-    with drawing.style():
+    with charts.style():
         figure, axes = pyplot.subplots(figsize=(6.0, 4.0), layout="constrained")
     values = [10.0 ** (0.05 * k) for k in range(12)]
-    drawing.log_axis(axes.xaxis, [1.0, 100.0], drawing.time_text)
-    drawing.log_axis(axes.yaxis, [1.0, 100.0], drawing.power_text)
-    drawing.finish_layout(figure)
-    drawing.label_points(axes, [drawing.Point(x, x, f"library {x:.2f}", drawing.OURS) for x in values])
+    charts.log_axis(axes.xaxis, [1.0, 100.0], charts.time_text)
+    charts.log_axis(axes.yaxis, [1.0, 100.0], charts.power_text)
+    charts.finish_layout(figure)
+    charts.label_points(axes, [charts.Point(x, x, f"library {x:.2f}", charts.OURS) for x in values])
     renderer = figure.canvas.get_renderer()
     boxes = [text.get_window_extent(renderer) for text in axes.texts]
     frame = axes.get_window_extent(renderer).padded(1.0)

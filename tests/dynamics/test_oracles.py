@@ -14,6 +14,7 @@ import pytest
 import warp_spo as spo
 from support import laws, oracles, zoo
 from support.granularities import of_random_scenes
+from support.quick import slow_unless
 from support.robots import ROBOTS, of_newtons_importer
 from warp_spo.newton import shipped
 
@@ -111,7 +112,7 @@ def test_algorithms_agree(oracle, name, armature, device):
 
 
 @pytest.mark.parametrize("oracle", ORACLES)
-@pytest.mark.parametrize("name", ["humanoid", "arm", "two_robots"])
+@pytest.mark.parametrize("name", slow_unless(["arm", "two_robots"], ["humanoid", "arm", "two_robots"]))
 def test_algorithms_agree_on_worlds_that_differ(name, oracle, device):
     """Masses, CoMs, inertias, anchors, armature and gravity of each world: one oracle a world."""
     scene = zoo.varied(scene_of(name), WORLDS)

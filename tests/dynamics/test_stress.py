@@ -71,7 +71,7 @@ def test_long_check(name, dtype, granularity, device):
     checks.LONG[name][0](Setting(device, dtype, granularity))
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("bodies, fits", [(7, True), (31, False)])
 def test_limbs_that_tell_each_other_more_than_shared_memory_holds_run_as_a_tree(bodies, fits, dtype, device):
     p = scenes.binary_tree(bodies)

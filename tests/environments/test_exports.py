@@ -124,7 +124,7 @@ def test_a_film_of_a_robot_of_ones_own(tmp_path):
     from PIL import Image
 
     still, path = (lambda observed: torch.zeros(2, 4)), tmp_path / "walk"
-    files = recording.play(legged(), still, path, 1.0, (0, 0, 0), renderer="numpy")
+    files = recording.play(legged(), still, path, 1.0, (0, 0, 0))
     assert [file.name for file in files] == ["walk.gif", "walk.png"]
     with Image.open(files[0]) as film, Image.open(files[1]) as strip:
         assert film.n_frames == 25 and strip.size[0] == 5 * 480
@@ -157,12 +157,12 @@ def test_an_action_that_moves_a_follower_is_exported_as_its_own_joint():
 
 def test_shapes_are_where_joints_and_contacts_are():
     """A capsule's ends are the joints, whichever way it points; a box is about the corners."""
-    from warp_spo.env import shapes
     from warp_spo.reference.rotations import rotation
+    from warp_spo.viewing import shapes
 
     for end in np.vstack([np.eye(3), -np.eye(3), np.random.default_rng(0).normal(size=(4, 3))]):
         start = np.array([0.1, -0.2, 0.3])
-        _, _, (_, half), pose, _ = shapes._capsule(0, start, end, 0.02, shapes.BODY)
+        _, _, (_, half), pose, _ = shapes.capsule(0, start, end, 0.02, shapes.BODY)
         axis = rotation(np.array(pose[3:])) @ [0, 0, half]
         assert np.allclose([pose[:3] - axis, pose[:3] + axis], [start, end])
     scene = spo.Scene(

@@ -1,5 +1,6 @@
 """Pieces of a scene as warps: barriers between them, results through shared memory, limbs that share code."""
 
+import itertools
 import re
 
 import numpy as np
@@ -9,6 +10,7 @@ import warp_spo as spo
 from support import laws, warp_machine, zoo
 from support.granularity_scenes import mirrored
 from support.pieces_of_trees import TREES, hand
+from support.quick import slow_unless
 from support.robots import ROBOTS
 from support.routines import ROUTINES
 from warp_spo.execution import plan
@@ -18,7 +20,8 @@ from warp_spo.recursions.model import shared_constants as alike
 from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.model.segments import Pieces
 
-LARGE = ("tree20", "three roots", "humanoid")  # trees of which a quick run takes one operation
+LARGE = ("tree20", "three roots", "humanoid")  # seconds: a quick run takes smaller trees of the same shapes
+EVERY = ("fork", "comb")  # trees of which a quick run takes every operation
 
 
 @pytest.mark.parametrize("name", TREES)
@@ -49,6 +52,8 @@ def test_pieces_wait_for_each_other(name):
 SEGMENTED = {"forward_dynamics": ("qd", "tau", "body_f"), "inverse_dynamics": ("qd", "qdd", "body_f"),
              "solve_mass_matrix": ("b",), "mass_matrix": (), "mass_matrix_inverse": ()}  # fmt: skip
 
+BRANCHED = [name for name in TREES if name != "chain"]
+
 
 def built(texts, scene, operation, worlds=3, dtype="float64", given=None, **options):
     """The text of one operation at segment granularity, not compiled, and its result where the machine runs it."""
@@ -67,14 +72,15 @@ def built(texts, scene, operation, worlds=3, dtype="float64", given=None, **opti
 
 @pytest.mark.parametrize(
     ("name", "operation"),
-    [
-        pytest.param(
-            name, operation, marks=pytest.mark.slow if name in LARGE and operation != "forward_dynamics" else ()
-        )
-        for name in TREES
-        for operation in SEGMENTED
-        if name != "chain"
-    ],
+    slow_unless(
+        [
+            (name, operation)
+            for name in BRANCHED
+            for operation in SEGMENTED
+            if name not in LARGE and (name in EVERY or operation in ("forward_dynamics", "mass_matrix_inverse"))
+        ],
+        itertools.product(BRANCHED, SEGMENTED),
+    ),
 )
 def test_warps_meet_at_barriers_alone(name, operation, monkeypatch):
     """The CUDA text, warp by warp in either order: nothing is read before it is sent, and the result is right."""
@@ -86,7 +92,7 @@ def test_warps_meet_at_barriers_alone(name, operation, monkeypatch):
 
 
 @pytest.mark.parametrize("operation", SEGMENTED)
-@pytest.mark.parametrize("name", ["fork", "hand", "humanoid"])
+@pytest.mark.parametrize("name", slow_unless(["fork", "hand"], ["fork", "hand", "humanoid"]))
 def test_results_over_rows_that_warps_share(name, operation, monkeypatch):
     """Many worlds: rows come in through shared memory, and the result takes the place of one of them."""
     monkeypatch.setattr(plan, "FEW_WORLDS", 0)

@@ -36,6 +36,7 @@ ROOMS = (
     "jax",
     "mujoco",
     "newton",
+    "viewing",
     "trials",
     "env",
     "command_line",

@@ -12,7 +12,8 @@ import warp as wp
 
 import warp_spo as spo
 from support import geared, implicit, laws, symbolic, zoo
-from support.hinge_twins import AGREE, SAME, difference, more_states, shapes
+from support.hinge_twins import AGREE, QUICK, SAME, difference, more_states, shapes
+from support.quick import slow_unless
 from support.step_scenes import FORCES, H, furnished
 from support.step_scenes import states as step_states
 from warp_spo.dynamics.loop_analysis import embedding
@@ -163,7 +164,7 @@ def test_every_trace_equals_the_dense_reference(model, name, given, shape, wante
         close(found[w], wanted(Dense(scene, a["q"][w]), {key: x[w] for key, x in a.items()}))
 
 
-@pytest.mark.parametrize("name", SAME)
+@pytest.mark.parametrize("name", slow_unless(QUICK, SAME))
 def test_full_and_reduced_rotors_agree(name):
     scene, (given, results, options) = tree("full"), SAME[name]
     sized, a = shapes(scene), more_states(scene)

@@ -58,6 +58,12 @@ SAME = {  # operation -> (arrays, {result: shape}, options)
     "coordinate_rates": ("q qd", {"out": "c"}, {}),
 }  # fmt: skip
 
+QUICK = [name for name in SAME if name not in (
+    "mass_matrix_inverse", "log_det_mass_matrix_gradient", "inverse_dynamics_derivatives", "solve_mass_matrix_vjp",
+    "hybrid_dynamics", "operational_inertia_inverse", "body_reactions", "quasi_velocity_coriolis"
+)]  # fmt: skip
+"""Operations of a quick run. The others take seconds and ask a hinge for nothing that these do not ask it for."""
+
 
 def more_states(scene):
     a, rng = states(scene), np.random.default_rng(8)

@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from . import film as films
-from . import robots, shapes
+from ..scene.scene import Scene
+from ..viewing import films, shapes
+from . import robots
 from .environment import Env
 
 STRIP = 10  # pictures of a strip
@@ -24,7 +25,7 @@ class Recording(NamedTuple):
 
     Attributes:
         q: coordinates [step, coordinate]. qd: velocities [step, dof]. commands: [step, command], or None.
-        step: length of a step [s]. ground: of the scene.
+        step: length of a step [s]. ground: of the scene. device: of the environment, which draws the pictures, too.
     """
 
     q: np.ndarray
@@ -32,6 +33,7 @@ class Recording(NamedTuple):
     commands: np.ndarray | None
     step: float
     ground: Any
+    device: Any
 
 
 def record(env: Env, policy: Any, seconds: float, command: Any = None, world: int = 0) -> Recording:
@@ -47,12 +49,12 @@ def record(env: Env, policy: Any, seconds: float, command: Any = None, world: in
         for rows, values in zip(states, (env.q, env.qd, env.command if commanded else env.q), strict=True):
             rows.append(values[world].cpu().numpy().copy())
     q, qd, commands = (np.array(rows) for rows in states)
-    return Recording(q, qd, commands if commanded else None, env.step_dt, env.scene.ground)
+    return Recording(q, qd, commands if commanded else None, env.step_dt, env.scene.ground, env.warp_device)
 
 
 def play(
     env: Env, policy: Any, path: str | Path, seconds: float = 8.0, command: Any = None,
-    camera: films.Camera | None = None, renderer: str | None = None, suffix: str = ".gif",
+    camera: films.Camera | None = None, suffix: str = ".gif",
 ) -> list[Path]:  # fmt: skip
     """Let a policy act in any environment, and draw world 0: write a film and a strip of ten pictures as PNG.
 
@@ -63,7 +65,6 @@ def play(
         path: of the film and the strip, without their endings.
         seconds: of the film. command: held if it is given, one number for each of the environment's commands.
         camera: None: one that sees all of the robot, from the side; it follows a floating base.
-        renderer: "mujoco", "numpy", or None: MuJoCo's if it works here.
         suffix: of the film: ".gif", ".webp", or ".mp4", which needs imageio-ffmpeg.
 
     Returns:
@@ -78,12 +79,12 @@ def play(
         )
     recorded, start = record(env, policy, seconds, command), env.default_q
     scene = env.scene.without_loops()
-    robot = robots.Robot("", path, scene, start, np.zeros(0), shapes.primitives(scene, start))
-    camera = shapes.camera_of(scene, start) if camera is None else camera
+    drawn = shapes.primitives(scene, start)
+    camera = films.camera_of(scene, start) if camera is None else camera
     follow = scene.hinges[0].coord_count == 7
     every = list(range(0, len(recorded.q), STEPS_A_PICTURE))
     pictures, few = (
-        _draw(robot, camera, follow, recorded, rows, captions(recorded, rows), [], renderer)
+        _draw(scene, drawn, camera, follow, recorded, rows, captions(recorded, rows), [])
         for rows in (every, strip_rows(recorded, not follow))
     )
     return [
@@ -96,18 +97,18 @@ def markers(task: Any, recorded: Recording, row: int) -> tuple:
     """Return what is drawn beside the robot: the place that a hand is asked to reach."""
     if recorded.commands is None or not hasattr(task, "PLACES"):
         return ()
-    return (robots.Primitive("sphere", -1, (0.025,), (*recorded.commands[row], 0, 0, 0, 1), (0.9, 0.25, 0.05)),)
+    return (shapes.Primitive("sphere", -1, (0.025,), (*recorded.commands[row], 0, 0, 0, 1), (0.9, 0.25, 0.05)),)
 
 
-def film(task: Any, recorded: Recording, every: int = 2, renderer: str | None = None) -> list:
+def film(task: Any, recorded: Recording, every: int = 2) -> list:
     """Return pictures of a recording, one of ``every`` steps."""
-    return _pictures(task, recorded, range(0, len(recorded.q), every), renderer)
+    return _pictures(task, recorded, range(0, len(recorded.q), every))
 
 
-def strip(task: Any, recorded: Recording, start: float = 0.5, renderer: str | None = None) -> list:
+def strip(task: Any, recorded: Recording, start: float = 0.5) -> list:
     """Return the pictures of a film strip, from a share of the recording on; a stride if it walks."""
     whole = recorded.q.shape[1] == 2 or hasattr(task, "PLACES")
-    return _pictures(task, recorded, strip_rows(recorded, whole, start), renderer)
+    return _pictures(task, recorded, strip_rows(recorded, whole, start))
 
 
 def strip_rows(recorded: Recording, whole: bool, start: float = 0.5) -> list[int]:
@@ -118,13 +119,13 @@ def strip_rows(recorded: Recording, whole: bool, start: float = 0.5) -> list[int
     return [int(row) for row in rows if row < len(recorded.q)]
 
 
-def _pictures(task: Any, recorded: Recording, rows: Any, renderer: str | None) -> list:
+def _pictures(task: Any, recorded: Recording, rows: Any) -> list:
     robot = robots.load(task.ROBOT, recorded.ground)
     rows, places = list(rows), hasattr(task, "PLACES")
     texts = captions(recorded._replace(commands=None) if places else recorded, rows)
     beside = [markers(task, recorded, row) for row in rows]
     follow = task.ROBOT not in ("cartpole", "panda")
-    return _draw(robot, task.CAMERA, follow, recorded, rows, texts, beside, renderer)
+    return _draw(robot.scene, robot.primitives, task.CAMERA, follow, recorded, rows, texts, beside)
 
 
 def captions(recorded: Recording, rows: Sequence[int]) -> list[str]:
@@ -137,23 +138,23 @@ def captions(recorded: Recording, rows: Sequence[int]) -> list[str]:
 
 
 def _draw(
-    robot: robots.Robot, camera: films.Camera, follow: bool, recorded: Recording, rows: Sequence[int], texts: list[str],
-    beside: list, renderer: str | None,
+    scene: Scene, drawn: Sequence[shapes.Primitive], camera: films.Camera, follow: bool, recorded: Recording,
+    rows: Sequence[int], texts: list[str], beside: list,
 ) -> list:  # fmt: skip
     """Return a picture of each row; a camera that follows looks from the side of where the robot faces at first."""
     if follow:
         _, _, z, w = recorded.q[rows[0], 3:7]
         camera = dataclasses.replace(camera, azimuth=camera.azimuth + 2.0 * float(np.arctan2(z, w)))
-    return films.pictures(robot, recorded.q[rows], camera, follow, beside, texts, renderer)
+    return films.pictures(scene, drawn, recorded.q[rows], camera, follow, beside, texts, recorded.device)
 
 
 def show(name: str, recorded: Recording, step: float) -> None:
     """Play a recording in Newton's viewer, in real time, again and again until its window is closed."""
     import time
 
-    from ..newton import viewing
+    from ..viewing.viewer import Viewer
 
-    viewer = viewing.Viewer(robots.FILES / f"{name}.xml")
+    viewer = Viewer(robots.FILES / f"{name}.xml")
     while viewer.is_running():
         for q in recorded.q:
             viewer.show(q, step)

@@ -111,7 +111,7 @@ def draw_curve(folder: str | Path, name: str) -> Path:
     folder = Path(folder)
     rows = read_rows(folder / "progress.jsonl")
     try:
-        from ..trials.drawing import OURS, load_pyplot, style
+        from ..viewing.charts import OURS, load_pyplot, style
 
         pyplot = load_pyplot("train")
     except ImportError:

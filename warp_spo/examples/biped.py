@@ -8,7 +8,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.examples.options import command, drawing, error_band
 from warp_spo.examples.parts import at, bar
-from warp_spo.trials.drawing import OURS, OURS_DARK, log_axis, power_text
+from warp_spo.viewing.charts import OURS, OURS_DARK, log_axis, power_text
 
 THIGH, SHANK, ROD, CRANK = 0.4, 0.4, 0.3, 0.06  # lengths [m]
 

@@ -9,7 +9,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.examples.options import command, drawing
 from warp_spo.examples.parts import about, at, oscillations
-from warp_spo.trials.drawing import OURS, OURS_DARK
+from warp_spo.viewing.charts import OURS, OURS_DARK
 
 STEEL, SLENDER = spo.Material(7850.0, 2.1e11), dict(damping_ratio=0.005, rotary=False)
 MAST, BOOM, JIB = (12.0, 0.45, 0.02), (18.0, 0.3, 0.01), (8.0, 0.15, 0.008)  # length, radius, wall [m]

@@ -12,7 +12,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.examples.options import command, drawing
 from warp_spo.examples.parts import at, bar
-from warp_spo.trials.drawing import FAINT, OURS, OURS_DARK
+from warp_spo.viewing.charts import FAINT, OURS, OURS_DARK
 
 TURN = dict(axis=(0, 0, 1))
 

@@ -11,7 +11,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.examples.options import command, drawing
 from warp_spo.examples.parts import at, bar
-from warp_spo.trials.drawing import FAINT, OURS
+from warp_spo.viewing.charts import FAINT, OURS
 
 
 def arm(links=4):

@@ -8,7 +8,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.examples.options import command, drawing, error_band
 from warp_spo.examples.parts import at, bar
-from warp_spo.trials.drawing import OURS, OURS_DARK
+from warp_spo.viewing.charts import OURS, OURS_DARK
 
 UPPER, LOWER, APART = 0.3, 0.5, 0.2  # lengths of the bars, and distance between the motors [m]
 MOTORS = ["left motor", "right motor"]

@@ -10,7 +10,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.examples.options import band, command, drawing
 from warp_spo.examples.parts import at, bar
-from warp_spo.trials.drawing import FAINT, OURS, log_axis
+from warp_spo.viewing.charts import FAINT, OURS, log_axis
 
 RADIUS, PERIOD = 0.1, 2.0  # of the circle [m], [s]
 STIFF, DAMP = 400.0, 40.0  # gains on the hand's errors in position [1/s^2] and velocity [1/s]

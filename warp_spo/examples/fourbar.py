@@ -9,7 +9,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.examples.options import command, drawing, error_band, some
 from warp_spo.examples.parts import at, bar
-from warp_spo.trials.drawing import OURS, OURS_DARK
+from warp_spo.viewing.charts import OURS, OURS_DARK
 
 CRANK, COUPLER, ROCKER, GROUND = 0.4, 0.9, 0.7, 1.0  # lengths of the bars, and of the ground between the pins [m]
 

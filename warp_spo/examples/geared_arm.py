@@ -11,7 +11,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.examples.options import command, drawing
 from warp_spo.examples.parts import at, bar
-from warp_spo.trials.drawing import OURS, OURS_DARK, count_text, log_axis, power_text
+from warp_spo.viewing.charts import OURS, OURS_DARK, count_text, log_axis, power_text
 
 SPIN = 1e-4  # moment of inertia of the rotor [kg m^2]
 TURN, MODELS = dict(axis=(0, 0, 1)), ("full", "reflected")

@@ -11,7 +11,7 @@ import numpy as np
 
 import warp_spo as spo
 from warp_spo.examples.options import command, drawing, some
-from warp_spo.trials.drawing import FAINT, OURS, OURS_DARK
+from warp_spo.viewing.charts import FAINT, OURS, OURS_DARK
 
 CUBE, MASS, FORCE = 0.025, 0.5, 40.0  # half its size [m], mass [kg], of each finger [N]
 QUARTER = np.sqrt(0.5)

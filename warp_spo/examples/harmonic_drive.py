@@ -10,7 +10,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.examples.options import command, drawing
 from warp_spo.examples.parts import bar
-from warp_spo.trials.drawing import FAINT, OURS, OURS_DARK, count_text, log_axis
+from warp_spo.viewing.charts import FAINT, OURS, OURS_DARK, count_text, log_axis
 
 MOTOR, ROD = 0.35, bar(0.8, 0.5)  # inertia of the motor at the arm's side of the gear [kg m^2], the arm
 ARM = ROD.inertia[2, 2] + ROD.mass * ROD.com[0] ** 2  # inertia of the arm about the hinge [kg m^2]

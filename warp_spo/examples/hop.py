@@ -13,7 +13,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.examples.options import command, drawing
 from warp_spo.examples.parts import at, bar
-from warp_spo.trials.drawing import OURS, log_axis
+from warp_spo.viewing.charts import OURS, log_axis
 
 DT, STEPS, KNOTS = 5e-3, 100, 11  # time step [s], steps of a rollout, knots of the torques
 LINK, FOOT = 0.25, 0.02  # length of thigh and shank, radius of the foot [m]

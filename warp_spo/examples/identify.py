@@ -13,7 +13,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.examples.options import command, drawing
 from warp_spo.examples.parts import at, bar
-from warp_spo.trials.drawing import FAINT, OURS, OURS_DARK
+from warp_spo.viewing.charts import FAINT, OURS, OURS_DARK
 
 MASSES, DAMPING = [2.0, 1.5, 0.7], [0.5, 0.3, 0.1]  # the true values [kg], [N m s/rad]
 DT, WINDOW = 2e-3, 20  # time step [s], steps of a window

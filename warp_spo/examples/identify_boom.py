@@ -10,7 +10,7 @@ import warp as wp
 
 import warp_spo as spo
 from warp_spo.examples.options import command, drawing
-from warp_spo.trials.drawing import FAINT, OURS
+from warp_spo.viewing.charts import FAINT, OURS
 
 LENGTH, TRUE, DT, STEPS = 24.0, np.array([0.7, 0.8, 0.9]), 4e-3, 100  # [m], in units of what is drawn, [s]
 

@@ -12,7 +12,7 @@ import warp as wp
 from warp_spo.examples import grasp
 from warp_spo.examples.options import command, drawing
 from warp_spo.newton import SolverSPO
-from warp_spo.trials.drawing import FAINT, OURS, OURS_DARK
+from warp_spo.viewing.charts import FAINT, OURS, OURS_DARK
 
 STIFFNESS, DAMPING = 5e4, 300.0  # of all shapes [N/m, N s/m]
 PAIRS = [("pad_*", "cube")]

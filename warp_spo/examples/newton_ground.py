@@ -11,7 +11,7 @@ import warp as wp
 from warp_spo import Status
 from warp_spo.examples.options import band, command, drawing
 from warp_spo.newton import SolverSPO, shipped
-from warp_spo.trials.drawing import OURS
+from warp_spo.viewing.charts import OURS
 
 DRIVES = {"quadruped": (2000.0, 20.0)}  # N m/rad, N m s/rad
 STAND = {"quadruped": [0.2, 0.4, -0.6, -0.2, -0.4, 0.6, -0.2, 0.4, -0.6, 0.2, -0.4, 0.6]}  # rad

@@ -61,7 +61,7 @@ def check_picture(file):
     """Raise an error unless a picture can be written to this file; None asks for no picture."""
     if file is None:
         return
-    from warp_spo.trials.drawing import load_pyplot
+    from warp_spo.viewing.charts import load_pyplot
 
     load_pyplot("--picture")
     path = Path(file)
@@ -84,7 +84,7 @@ def drawing(file, *titles):
     """
     from matplotlib.figure import Figure
 
-    from warp_spo.trials.drawing import style
+    from warp_spo.viewing.charts import style
 
     with style():
         figure = Figure((5.2 * len(titles), 4.6), layout="constrained")
@@ -112,7 +112,7 @@ def error_band(axes, x, values, color, label):
 
     From step to step these errors are noise. An error of exactly zero is drawn at the bottom.
     """
-    from warp_spo.trials.drawing import log_axis, power_text
+    from warp_spo.viewing.charts import log_axis, power_text
 
     ends = np.arange(0, len(values), max(1, len(values) // POINTS))
     values = np.maximum.reduceat(np.maximum(values, LEAST), ends)

@@ -10,7 +10,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.examples.options import command, drawing, error_band
 from warp_spo.examples.parts import at, bar
-from warp_spo.trials.drawing import OTHER, OURS
+from warp_spo.viewing.charts import OTHER, OURS
 
 ITERATIONS = 10  # of the midpoint's equations; each brings about one more digit
 

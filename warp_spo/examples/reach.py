@@ -12,7 +12,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.examples.options import band, command, drawing
 from warp_spo.examples.parts import at, bar
-from warp_spo.trials.drawing import OURS, log_axis
+from warp_spo.viewing.charts import OURS, log_axis
 
 DT, STEPS, KNOTS = 2e-3, 500, 11  # time step [s], steps of a rollout, knots of the torques
 START = [0.0, 0.5, 0.0, 1.2, 0.0, 0.6, 0.0]  # joint angles at the start [rad]

@@ -8,7 +8,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.examples.options import command, drawing, some
 from warp_spo.examples.parts import at, bar
-from warp_spo.trials.drawing import FAINT, OURS
+from warp_spo.viewing.charts import FAINT, OURS
 
 CRANK, ROD = 0.1, 0.3  # lengths [m]
 

@@ -10,7 +10,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.examples.options import command, drawing
 from warp_spo.examples.parts import oscillations
-from warp_spo.trials.drawing import FAINT, OURS, OURS_DARK
+from warp_spo.viewing.charts import FAINT, OURS, OURS_DARK
 
 ACROSS = [3.5160, 4.1373, 5.5850, 7.3604, 9.2568, 11.2023, 13.1702]  # lowest rates at the spins 0, 2, ... 12
 WITHIN = [3.5160, 3.6218, 3.8977, 4.2634, 4.6577, 5.0505, 5.4304]  # in the plane of rotation

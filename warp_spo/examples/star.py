@@ -10,7 +10,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.examples.options import band, command, drawing
 from warp_spo.examples.parts import about, at, bar
-from warp_spo.trials.drawing import OURS, OURS_DARK
+from warp_spo.viewing.charts import OURS, OURS_DARK
 
 RADIUS, MASS, HUB = 0.5, 0.02, 0.2  # rim [m], each rod [kg], hub [kg m^2]
 TURNS = 2.0 * np.pi * np.arange(512) / 512  # where the rods hang [rad]

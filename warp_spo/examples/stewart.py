@@ -9,7 +9,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.examples.options import band, command, drawing, error_band
 from warp_spo.examples.parts import about, at, bar
-from warp_spo.trials.drawing import OURS
+from warp_spo.viewing.charts import OURS
 
 BASE, PLATFORM, HEIGHT = 1.0, 0.5, 1.0  # radii of the joints on base and platform, and height of the platform [m]
 

@@ -10,7 +10,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.examples.options import command, drawing, error_band
 from warp_spo.examples.parts import at, bar
-from warp_spo.trials.drawing import FAINT, OURS, OURS_DARK
+from warp_spo.viewing.charts import FAINT, OURS, OURS_DARK
 
 LINKS, LENGTH, MASS, DRAG = 32, 5.0, 2.0, 3.0  # tether [m, kg]; drag per velocity and mass [1/s]
 

@@ -11,8 +11,8 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from . import drawing
-from .drawing import Point
+from ..viewing import charts
+from ..viewing.charts import Point
 
 HEADS = ("operation", "granularity", "precision", "error", "time", "evaluations/s")
 BAR = 30  # characters
@@ -118,10 +118,10 @@ def table(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 
 def image(figure: Any) -> str:
     """Return a figure as an image inside the page."""
-    return f'<img src="data:image/svg+xml;base64,{base64.b64encode(drawing.svg(figure).encode()).decode()}">'
+    return f'<img src="data:image/svg+xml;base64,{base64.b64encode(charts.svg(figure).encode()).decode()}">'
 
 
-@drawing.style()
+@charts.style()
 def picture(pyplot: Any, title: str, rows: Sequence[dict], tolerance: dict[str, float]) -> Any:
     """Draw error against run time, both logarithmic, a panel a precision, a point with its name an operation.
 
@@ -141,29 +141,29 @@ def picture(pyplot: Any, title: str, rows: Sequence[dict], tolerance: dict[str, 
         bottom = min([row["error"] for row in shown if row["error"] > 0.0], default=1e-16) / 3.0
         errors = [max(row["error"], bottom) for row in shown]
         least = [max(row["least"], bottom) for row in shown]
-        drawing.log_axis(axes.xaxis, [1e6 * time for row in rows for time in row["range"]], drawing.time_text)
-        drawing.log_axis(axes.yaxis, [*errors, *least] or [bottom], drawing.power_text)
+        charts.log_axis(axes.xaxis, [1e6 * time for row in rows for time in row["range"]], charts.time_text)
+        charts.log_axis(axes.yaxis, [*errors, *least] or [bottom], charts.power_text)
         for row, error, low in zip(shown, errors, least, strict=True):
-            bars = {"color": drawing.OURS, "linewidth": 1.0, "alpha": 0.45, "zorder": 2.0}
+            bars = {"color": charts.OURS, "linewidth": 1.0, "alpha": 0.45, "zorder": 2.0}
             axes.plot([1e6 * time for time in row["range"]], [error, error], **bars)
             axes.plot([1e6 * row["seconds"]] * 2, [low, error], **bars)
         lost = f", {len(mine) - len(shown)} without a result" if len(shown) < len(mine) else ""
-        axes.set_title(f"{dtype}, tolerance {drawing.power_text(tolerance[dtype])}{lost}")
+        axes.set_title(f"{dtype}, tolerance {charts.power_text(tolerance[dtype])}{lost}")
         axes.set_ylabel("largest relative error")
-        points = [Point(1e6 * row["seconds"], error, row["op"], drawing.OURS if error <= tolerance[dtype] else
-                  drawing.INK) for row, error in zip(shown, errors, strict=True)]  # fmt: skip
-        panels.append((axes, drawing.MARKERS[dtype], points))
+        points = [Point(1e6 * row["seconds"], error, row["op"], charts.OURS if error <= tolerance[dtype] else
+                  charts.INK) for row, error in zip(shown, errors, strict=True)]  # fmt: skip
+        panels.append((axes, charts.MARKERS[dtype], points))
     grid[-1, 0].set_xlabel("run time of all worlds")
-    drawing.title(figure, f"{title}: lower left is better")
-    handles = [Line2D([], [], marker=marker, linestyle="", color=drawing.OURS, label=f"warp_spo, {dtype}")
+    charts.title(figure, f"{title}: lower left is better")
+    handles = [Line2D([], [], marker=marker, linestyle="", color=charts.OURS, label=f"warp_spo, {dtype}")
                for (_, marker, _), dtype in zip(panels, dtypes, strict=True)]  # fmt: skip
-    if any(point.color == drawing.INK for _, _, points in panels for point in points):
-        handles.append(Line2D([], [], marker="o", linestyle="", color=drawing.INK, label="beyond the tolerance"))
-    handles.append(Line2D([], [], color=drawing.OURS, linewidth=1.0, alpha=0.45, label=BARS))
-    drawing.legend_below(figure, handles)
-    drawing.finish_layout(figure)
+    if any(point.color == charts.INK for _, _, points in panels for point in points):
+        handles.append(Line2D([], [], marker="o", linestyle="", color=charts.INK, label="beyond the tolerance"))
+    handles.append(Line2D([], [], color=charts.OURS, linewidth=1.0, alpha=0.45, label=BARS))
+    charts.legend_below(figure, handles)
+    charts.finish_layout(figure)
     for axes, marker, points in panels:
         for x, y, _, color, _ in points:
             axes.plot(x, y, marker, color=color, markersize=6.0, markeredgecolor="white", markeredgewidth=0.6, zorder=4)
-        drawing.label_points(axes, [point._replace(color=drawing.INK) for point in points])
+        charts.label_points(axes, [point._replace(color=charts.INK) for point in points])
     return figure

@@ -9,33 +9,18 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ... import Contact, Plane, Scene, from_mujoco
+from ...viewing.shapes import Primitive
 
 FILES = Path(__file__).parent
 NAMES = ("cartpole", "ant", "panda", "go2", "g1")
 LOOK, TOUCH = 2, 3  # groups of geoms in the files
 SHAPES = {2: ("sphere", 1), 3: ("capsule", 2), 6: ("box", 3)}
 """MuJoCo's number of a kind of geom -> its name and how many sizes it has."""
-
-
-class Primitive(NamedTuple):
-    """A shape that is drawn, fixed to a body.
-
-    Attributes:
-        kind: "sphere", "capsule" or "box". body: index of the body; -1: the world.
-        size: radius [m]; radius and half length along z; half the sizes.
-        pose: position [m] and quaternion (xyzw) in the body frame [7]. color: red, green, blue, 0 to 1.
-    """
-
-    kind: str
-    body: int
-    size: tuple[float, ...]
-    pose: tuple[float, ...]
-    color: tuple[float, float, float]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from ... import where
+from ...viewing import Camera
 from .. import Env, Observation, World, actions, evaluation, events, observations, rewards, robots, terminations
-from ..film import Camera
 from ..learning import Learner
 from . import velocity
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ...viewing import Camera
 from .. import Env, Observation, World, actions, evaluation, events, observations, robots
-from ..film import Camera
 from ..learning import Learner
 
 ROBOT = "cartpole"

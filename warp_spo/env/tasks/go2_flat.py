@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ...viewing import Camera
 from .. import Env, actions, commands, evaluation, rewards, robots, terminations
-from ..film import Camera
 from ..learning import Learner
 from . import velocity
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from ... import terrain
+from ...viewing import Camera
 from .. import Env, Observation, actions, commands, evaluation, events, observations, robots, terminations
-from ..film import Camera
 from ..learning import Learner
 from . import go2_flat, velocity
 from .go2_flat import FEET, ROBOT

@@ -1,15 +1,32 @@
-"""Shapes to draw of any scene: what touches the ground, and a bone from each joint to the next."""
+"""Shapes to draw of any scene: what touches the ground, a bone from each joint to the next, contact forces."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
+from ..reference.rotations import rotation
 from ..scene.scene import Scene
-from .film import Camera
-from .robots import Primitive
 
-BODY, TOUCH = (0.55, 0.6, 0.68), (0.16, 0.42, 0.72)
+BODY, TOUCH, FORCE = (0.55, 0.6, 0.68), (0.16, 0.42, 0.72), (0.91, 0.27, 0.04)
 THICK, LEAST = 0.035, 0.008  # radius of a bone: a share of the robot's size, and the least [m]
+
+
+class Primitive(NamedTuple):
+    """A shape that is drawn, fixed to a body.
+
+    Attributes:
+        kind: "sphere", "capsule" or "box". body: index of the body; -1: the world.
+        size: radius [m]; radius and half length along z; half the sizes.
+        pose: position [m] and quaternion (xyzw) in the body frame [7]. color: red, green, blue, 0 to 1.
+    """
+
+    kind: str
+    body: int
+    size: tuple[float, ...]
+    pose: tuple[float, ...]
+    color: tuple[float, float, float]
 
 
 def primitives(scene: Scene, q: np.ndarray) -> tuple[Primitive, ...]:
@@ -34,7 +51,26 @@ def primitives(scene: Scene, q: np.ndarray) -> tuple[Primitive, ...]:
             ends = [np.array(scene.bodies[body].com)]
         if body in touching and body not in carried:
             ends = [np.array(point.position) for point in scene.contact_points if point.body == body][:1]
-        found += [_capsule(body, start, end, radius, BODY) for end in ends if np.linalg.norm(end - start) > 1e-6]
+        found += [capsule(body, start, end, radius, BODY) for end in ends if np.linalg.norm(end - start) > 1e-6]
+    return tuple(found)
+
+
+def forces(
+    scene: Scene, poses: np.ndarray, vectors: np.ndarray, radius: float, side: np.ndarray
+) -> tuple[Primitive, ...]:  # fmt: skip
+    """Return contact forces as thin capsules that stand on the ground beside the contact points.
+
+    Args:
+        poses: of the bodies [body, 7]. vectors: forces, scaled to the length that is drawn [point, 3] [m].
+        radius: of a capsule [m]. side: horizontal unit vector towards the camera (3,), so that feet hide no force.
+    """
+    found = []
+    for point, vector in zip(scene.contact_points, vectors, strict=True):
+        pose = poses[point.body]
+        start = pose[:3] + rotation(pose[3:]) @ point.position - (0.0, 0.0, point.radius)
+        start = start + (point.radius + radius) * side
+        if np.linalg.norm(vector) > radius:
+            found.append(capsule(-1, start, start + vector, radius, FORCE))
     return tuple(found)
 
 
@@ -47,22 +83,17 @@ def size_of(scene: Scene, q: np.ndarray) -> float:
     return max(float(np.linalg.norm(np.ptp(poses[:, :3], axis=0))), *reach, 0.1)
 
 
-def camera_of(scene: Scene, q: np.ndarray) -> Camera:
-    """Return a camera that sees all of a robot."""
-    return Camera(distance=1.0 + 1.6 * size_of(scene, q))
-
-
 def _contact(body: int, points: np.ndarray, own: float, radius: float) -> Primitive:
     """Return the shape about the points of a contact, of spheres of a radius ``own``."""
     if len(points) == 1:
         return Primitive("sphere", body, (max(own, 0.5 * radius),), (*points[0].tolist(), 0, 0, 0, 1), TOUCH)
     if len(points) == 2:
-        return _capsule(body, points[0], points[1], max(own, 0.5 * radius), TOUCH)
+        return capsule(body, points[0], points[1], max(own, 0.5 * radius), TOUCH)
     half, middle = 0.5 * np.ptp(points, axis=0) + own, 0.5 * (points.min(axis=0) + points.max(axis=0))
     return Primitive("box", body, tuple(np.maximum(half, 1e-3).tolist()), (*middle.tolist(), 0, 0, 0, 1), TOUCH)
 
 
-def _capsule(
+def capsule(
     body: int, start: np.ndarray, end: np.ndarray, radius: float, color: tuple[float, float, float]
 ) -> Primitive:
     """Return a capsule between two points of a body."""
