@@ -14,8 +14,7 @@ import warp as wp
 from warp_spo.__main__ import find_device
 from warp_spo.viewing import charts
 
-from .table import cases as data
-from .table import commits, evidence, pictures, roofline, runner, table
+from .table import cases, commits, evidence, pictures, roofline, runner, table
 from .table.cases import case_name
 from .table.precisions import PRECISIONS
 
@@ -30,11 +29,11 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("filter", nargs="?", default="", help="regular expression, such as humanoid.forward or phi.*float32")
     p.add_argument("--device", help="Warp device; default: the current one")
     p.add_argument(
-        "--worlds", type=int, nargs="+", metavar="N", help=f"world counts; default: {data.WORLDS[0]}, or on a CPU "
-        f"{data.CPU_WORLDS[0]}"
+        "--worlds", type=int, nargs="+", metavar="N", help=f"world counts; default: {cases.WORLDS[0]}, or on a CPU "
+        f"{cases.CPU_WORLDS[0]}"
     )  # fmt: skip
     p.add_argument("--dtype", nargs="+", choices=PRECISIONS, metavar="P", help=f"precisions: {', '.join(PRECISIONS)}")
-    names = [name or PLAN for name in data.GRANULARITIES]
+    names = [name or PLAN for name in cases.GRANULARITIES]
     p.add_argument("--granularity", nargs="+", choices=names, metavar="G", help=f"{', '.join(names)}; default: {PLAN}")
     p.add_argument("--sweeps", action="store_true", help="growing world counts, chains and trees instead of robots")
     p.add_argument("--check", action="store_true", help="compare with the reference, and time nothing")
@@ -98,9 +97,9 @@ def choose(options: Any, cuda: bool) -> list[dict]:
     Raises:
         ValueError: they select none.
     """
-    worlds = options.worlds or (data.WORLDS if cuda else data.CPU_WORLDS)
+    worlds = options.worlds or (cases.WORLDS if cuda else cases.CPU_WORLDS)
     granularities = [None if name == PLAN else name for name in options.granularity or [PLAN]]
-    return data.cases(options.filter, worlds, options.dtype or data.DTYPES, granularities, options.sweeps, cuda)
+    return cases.cases(options.filter, worlds, options.dtype or cases.DTYPES, granularities, options.sweeps, cuda)
 
 
 def measure(chosen: list[dict], options: Any, device: wp.Device) -> int:

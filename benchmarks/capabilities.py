@@ -33,10 +33,9 @@ import warp as wp
 
 import warp_spo as spo
 from warp_spo.trials.inputs import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
-from warp_spo.trials.trial import Subject, Trial, all_finite
+from warp_spo.trials.trial import Subject, TrialRun, all_finite
 
-from .table import process_turns as turns
-from .table import robots, runner
+from .table import process_turns, robots, runner
 
 DT = 2e-3  # [s]
 SETS = 4
@@ -63,7 +62,7 @@ def measure_time(run: Callable[[int], Any], device: wp.Device) -> float:
 def median_replay(graph: Any, device: wp.Device) -> float:
     """Return the median time of replays of a graph [ms], in a turn of this process and with clocks that have risen."""
     events = [[wp.Event(device, enable_timing=True) for _ in range(2)] for _ in range(REPEATS)]
-    with turns.mine:
+    with process_turns.mine:
         begin = time.perf_counter()
         while time.perf_counter() - begin < WARM_UP:
             wp.capture_launch(graph)
@@ -150,9 +149,9 @@ def operation_cases(*names: str) -> Callable[..., Iterator[tuple[str, Callable[[
 
 def measure_operation(subject: Subject, name: str) -> dict:
     """Return ``us`` and ``error`` of an operation; an error beyond the tolerance raises AssertionError."""
-    trial = Trial(subject, (OPERATIONS | APPLICATIONS)[name], SAMPLE)
+    trial = TrialRun(subject, (OPERATIONS | APPLICATIONS)[name], SAMPLE)
     checked = trial.check()
-    with turns.mine:
+    with process_turns.mine:
         timing, left = trial.measure(REPEATS)
     error, tolerance = float(np.max([checked, left])), TOLERANCE["float32"]
     assert error <= tolerance, f"error {error:.1e} exceeds the tolerance {tolerance:.0e}"
@@ -255,7 +254,7 @@ GROUPS = dict(
 )
 
 
-def _measure(task: tuple[str, str, int, str], turn: turns.Turn | None = None) -> Iterator[dict]:
+def _measure(task: tuple[str, str, int, str], turn: process_turns.Turn | None = None) -> Iterator[dict]:
     """Yield the row of a case."""
     group, name, worlds, device = task
     wp.config.log_level = wp.LOG_WARNING
@@ -286,7 +285,7 @@ def main(arguments: list[str] | None = None) -> int:
         for name, _ in cases(worlds, device)
         if re.search(options.pattern, f"{group} {name}")
     }
-    found = turns.take_turns(list(rows), _measure, options.seconds, options.jobs)
+    found = process_turns.take_turns(list(rows), _measure, options.seconds, options.jobs)
     if device.is_cpu:
         found = ((case, row) for case in rows for row in _measure(case))
     for case, row in found:

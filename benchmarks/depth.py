@@ -34,7 +34,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.execution import plan
 from warp_spo.trials.inputs import OPERATIONS, Inputs
-from warp_spo.trials.trial import Subject, Trial
+from warp_spo.trials.trial import Subject, TrialRun
 from warp_spo.viewing import charts
 
 from .table import runner
@@ -159,19 +159,19 @@ def measure(
     timing, _ = trial.measure(REPEATS, WARM_UP, BUDGET)
     row = dict(us=1e6 * timing.median, p10_us=1e6 * timing.low, p90_us=1e6 * timing.high, error=error)
     row |= dict(launches=len(launched), compile_s=trial.first_call, granularity=dyn.granularity)
-    return row | dict(stretch=dyn.plan.stretch)
+    return row | dict(stretch=dyn.plan.block_length)
 
 
 def trial_of(
     scene: spo.Scene, worlds: int, device: wp.Device, dtype: str, options: dict, nodes: int, inputs: list
-) -> tuple[Trial, spo.Dynamics]:
+) -> tuple[TrialRun, spo.Dynamics]:
     """Return a trial of forward dynamics with so many nodes in a stretch."""
     default, plan.STRETCH = plan.STRETCH, nodes or plan.STRETCH
     try:
         dyn = spo.Dynamics(scene, worlds, device, dtype, **options)
     finally:
         plan.STRETCH = default
-    return Trial(Subject(dyn, inputs), FORWARD_DYNAMICS, min(SAMPLE, worlds)), dyn
+    return TrialRun(Subject(dyn, inputs), FORWARD_DYNAMICS, min(SAMPLE, worlds)), dyn
 
 
 def print_parts(scene: spo.Scene, worlds: int, device: wp.Device, dtype: str, inputs: Inputs) -> None:

@@ -201,7 +201,7 @@ def picture(rows: list[dict]) -> Any:
         for x, y, row in front if mine[0][2]["worlds"] == 1 else ():
             if 2.0 * y < last:
                 rule = ", semi-implicit" if row.get("integrator") == "semi_implicit" else ""
-                names.append(charts.Point(x, y, f"{row['model']}{rule}, {row['dt_ms']:g} ms", color))
+                names.append(charts.ChartPoint(x, y, f"{row['model']}{rule}, {row['dt_ms']:g} ms", color))
                 last = y
     charts.legend_below(figure, handles)
     charts.finish_layout(figure)

@@ -30,11 +30,10 @@ from warp_spo.dynamics import dynamics
 from warp_spo.examples import grasp
 from warp_spo.execution.device_facts import DeviceFacts, read_facts
 from warp_spo.trials.inputs import OPERATIONS, TOLERANCE, Inputs
-from warp_spo.trials.trial import Subject, Trial
+from warp_spo.trials.trial import Subject, TrialRun
 
 from .capabilities import DT, KD, KE
-from .table import process_turns as turns
-from .table import robots, runner
+from .table import process_turns, robots, runner
 from .table.occupied_gpu import crowd
 
 sys.path.append(str(Path(__file__).parent.parent / "tests"))  # the random trees come from the tests
@@ -136,7 +135,7 @@ def prepared(dyn: spo.Dynamics, operation: str, inputs: list[Inputs], results: l
         results.append(steps.out[1].numpy()[:256])
         difference = np.abs(results[-1] - results[0]).max() / np.abs(results[0]).max()
         return Timed(steps.evaluate, 1, dyn.device), float(difference) * TOLERANCE["float32"] / STEPS_AGREE
-    trial = Trial(Subject(dyn, inputs), OPERATIONS[operation], SAMPLE)
+    trial = TrialRun(Subject(dyn, inputs), OPERATIONS[operation], SAMPLE)
     error = trial.check()
     return Timed(trial.evaluate, SETS, dyn.device), error
 
@@ -145,7 +144,7 @@ def candidates(dyn: spo.Dynamics, operation: str) -> list[str]:
     """Return the granularities at which the operation can run, and that are worth timing."""
     routine = dyn._operations[operation].routine
     assert routine is not None
-    limbs = bool(routine.letters) and 1 < dyn.plan.limbs <= 16
+    limbs = bool(routine.letters) and 1 < dyn.plan.leaf_segments <= 16
     return ["tree", *["segment"] * limbs, *["node"] * (routine.has_node_form and dyn.worlds <= NODE_WORLDS)]
 
 
@@ -169,17 +168,17 @@ def compare(name: str, operation: str, worlds: int, device: str | None, leave: i
         if twin == granularity:
             timed[granularity] = found
     chosen = planned.plan.of(planned._operations[operation].routine)
-    with turns.mine, crowd(planned.device, leave):
+    with process_turns.mine, crowd(planned.device, leave):
         for _ in range(REPEATS):
             for each in timed.values():
                 each.measure()
     times = {granularity: each.us for granularity, each in timed.items()}
     ratio = times[PLAN if PLAN in times and chosen != "node" else chosen] / min(times.values())
-    row = dict(scene=name, dofs=scene.dof_count, limbs=planned.plan.limbs, operation=operation, worlds=worlds)
+    row = dict(scene=name, dofs=scene.dof_count, limbs=planned.plan.leaf_segments, operation=operation, worlds=worlds)
     return row | dict(us=times, chosen=chosen, ratio=ratio, error=max(errors))
 
 
-def _measure(task: tuple, turn: turns.Turn | None = None) -> Iterator[dict[str, Any]]:
+def _measure(task: tuple, turn: process_turns.Turn | None = None) -> Iterator[dict[str, Any]]:
     """Yield the row of a case."""
     name, operation, [worlds], device, leave, facts = task
     wp.config.log_level = wp.LOG_WARNING
@@ -188,7 +187,7 @@ def _measure(task: tuple, turn: turns.Turn | None = None) -> Iterator[dict[str, 
     gc.collect()
 
 
-def _compile(task: tuple, turn: turns.Turn | None = None) -> Iterator[dict[str, Any]]:
+def _compile(task: tuple, turn: process_turns.Turn | None = None) -> Iterator[dict[str, Any]]:
     """Compile the kernels of a case; yield nothing."""
     name, operation, counts, device, _, facts = task
     wp.config.log_level = wp.LOG_WARNING
@@ -232,7 +231,7 @@ def main(arguments: list[str] | None = None) -> int:
         work, counts = _compile, [options.worlds]
     tasks = [(*case, worlds, str(device), options.leave, facts) for case in cases for worlds in counts]
     if device.is_cuda:
-        found = turns.take_turns(tasks, work, options.seconds, options.jobs)
+        found = process_turns.take_turns(tasks, work, options.seconds, options.jobs)
     else:
         found = ((task, row) for task in tasks for row in work(task))
     rows: list[dict] = []

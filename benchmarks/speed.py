@@ -32,7 +32,7 @@ import warp as wp
 
 import warp_spo as spo
 from warp_spo.trials.inputs import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
-from warp_spo.trials.trial import Subject, Trial
+from warp_spo.trials.trial import Subject, TrialRun
 
 from . import limits, step_parts, substeps
 from .contact import scenes
@@ -64,7 +64,7 @@ WORK = {SOLVER_STEP: 8.0, FIRST_STEP: 3.0, "forward_dynamics_derivatives": 6.0} 
 REFERENCE = Call("go2", "forward_dynamics", MANY)  # is timed three times in a run of all lines
 
 
-def trial_of(call: Call, device: wp.Device, sets: int = SETS) -> Trial | step_parts.SolverTrial:
+def trial_of(call: Call, device: wp.Device, sets: int = SETS) -> TrialRun | step_parts.SolverTrial:
     """Return the trial of a call, after its first evaluation."""
     if call.operation in STEPS:
         trial = _solver_trial(call.robot, call.worlds, str(device))
@@ -73,7 +73,7 @@ def trial_of(call: Call, device: wp.Device, sets: int = SETS) -> Trial | step_pa
         return trial
     inputs = _inputs(call.robot, call.worlds, 1 if call.worlds >= MOST else sets)
     dyn = spo.Dynamics(inputs[0].scene, call.worlds, device, call.dtype, variable=call.variable)
-    return Trial(Subject(dyn, inputs), (OPERATIONS | APPLICATIONS)[call.operation], SAMPLE)
+    return TrialRun(Subject(dyn, inputs), (OPERATIONS | APPLICATIONS)[call.operation], SAMPLE)
 
 
 @functools.lru_cache(maxsize=1)

@@ -166,7 +166,7 @@ class SolverTrial:
         return exact, (qd, exact.step(q, qd, None, DT, target_q=target)[1])
 
     def measure(self, *_: Any) -> tuple[Timing, float]:
-        """Return the time of a step of driven states [s], and the error; as ``warp_spo.trials.trial.Trial.measure``."""
+        """Return the time of a step of driven states [s], and the error; see ``TrialRun.measure``."""
         seconds = 1e-6 * measure_time(self.driven(), self.device)
         return Timing(seconds, seconds, seconds), 0.0
 

@@ -52,7 +52,7 @@ class Free(VecEnv):
         return {"/episode/seconds": torch.zeros((), device=self.device)}
 
 
-class Times(learning.Course):
+class Times(learning.TrainingLog):
     """The times of collecting and learning, iteration after iteration."""
 
     def log(self, collect_time: float, learn_time: float, **others: Any) -> None:  # type: ignore[override]

@@ -16,7 +16,7 @@ import warp as wp
 
 import warp_spo as spo
 from warp_spo.trials.inputs import OPERATIONS, TOLERANCE, Inputs
-from warp_spo.trials.trial import Subject, Trial
+from warp_spo.trials.trial import Subject, TrialRun
 
 from .table.cases import SCENES
 from .table.resources import record_launches, resources
@@ -63,7 +63,7 @@ def measure(scene: spo.Scene, worlds: int, device: Any, granularity: str | None,
     """Return ``us`` of an evaluation, ``set_us`` of setting all variable values, ``error``, and a ``text`` to print."""
     dyn = spo.Dynamics(scene, worlds, device, granularity=granularity, variable=variable)
     with record_launches() as launched:
-        trial = Trial(Subject(dyn, inputs), OPERATIONS[OPERATION], SAMPLE)
+        trial = TrialRun(Subject(dyn, inputs), OPERATIONS[OPERATION], SAMPLE)
     found = resources(launched, dyn.device)
     timing, error = trial.measure(REPEATS, WARM_UP, BUDGET)
     row: dict = dict(us=1e6 * timing.median, error=error)

@@ -11,7 +11,7 @@ import warp as wp
 
 
 @wp.struct
-class Round:
+class DoublingTables:
     """The blocks of E^(2^r)."""
 
     row_node: wp.array[int]  # [row], the node that a row of a vector belongs to
@@ -29,7 +29,7 @@ def inward(T) -> wp.Kernel:
 
     @wp.kernel(module=f"warp_spo_doubling_{T.__name__}", enable_backward=False)
     def doubling_inward(
-        tables: Round,
+        tables: DoublingTables,
         weights: wp.array2d[T],
         alpha: T,
         accumulate: bool,
@@ -61,7 +61,7 @@ def outward(T) -> wp.Kernel:
 
     @wp.kernel(module=f"warp_spo_doubling_{T.__name__}", enable_backward=False)
     def doubling_outward(
-        tables: Round,
+        tables: DoublingTables,
         weights: wp.array2d[T],
         alpha: T,
         accumulate: bool,
@@ -96,7 +96,11 @@ def square(T) -> wp.Kernel:
 
     @wp.kernel(module=f"warp_spo_doubling_{T.__name__}", enable_backward=False)
     def doubling_square(
-        before: Round, after: Round, nodes: wp.array[int], weights: wp.array2d[T], squared_out: wp.array2d[T]
+        before: DoublingTables,
+        after: DoublingTables,
+        nodes: wp.array[int],
+        weights: wp.array2d[T],
+        squared_out: wp.array2d[T],
     ):
         entry, index, world = wp.tid()
         node = nodes[index]

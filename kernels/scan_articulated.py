@@ -1,10 +1,10 @@
-"""Articulated inertias along a path in few rounds: stretches as elements of an associative scan.
+"""Articulated inertias along a path in few rounds: blocks as elements of an associative scan.
 
-A stretch that receives the articulated inertia X and the force x at its outer end hands on
+A block that receives the articulated inertia X and the force x at its outer end hands on
 
     P+ = C + A (X^-1 + J)^-1 A*
 
-The element (A, C, J) does not depend on X. C is what a stretch hands on if it receives nothing, J the mobility that its
+The element (A, C, J) does not depend on X. C is what a block hands on if it receives nothing, J the mobility that its
 hinges give to the outer end while its inner end is held, and A how a force passes. A node with hinge H* extends the
 element further in by
 
@@ -24,7 +24,7 @@ import warp as wp
 
 from .articulated import dof_elimination
 from .elementary import EPSILON
-from .topology import Stretches, Topology
+from .topology import PathBlocks, Topology
 
 
 @functools.cache
@@ -91,12 +91,12 @@ def matrices(s) -> types.SimpleNamespace:
 
     @wp.func
     def add_branches(
-        P: vec21, topology: Topology, stretches: Stretches, stretch: int, articulated: wp.array3d[T], world: int
+        P: vec21, topology: Topology, path_blocks: PathBlocks, path_block: int, articulated: wp.array3d[T], world: int
     ):
-        """Return P plus phi P+ phi* of the nodes that hang on the outermost node of a stretch beside its path."""
-        outermost, feed = stretches.nodes[stretches.first[stretch]], stretches.feed[stretch]
+        """Return P plus phi P+ phi* of the nodes that hang on the outermost node of a block beside its path."""
+        outermost, path_child = path_blocks.nodes[path_blocks.first[path_block]], path_blocks.path_child[path_block]
         for c in range(topology.child_start[outermost], topology.child_start[outermost + 1]):
-            if topology.children[c] != feed:
+            if topology.children[c] != path_child:
                 P += s.load_articulated(articulated, topology.children[c], world)
         return P
 
@@ -105,7 +105,7 @@ def matrices(s) -> types.SimpleNamespace:
 
 @functools.cache
 def element(s) -> wp.Kernel:
-    """Compute (A, C, J) of each stretch of one path level; one thread for each (stretch, world).
+    """Compute (A, C, J) of each block of one path level; one thread for each (block, world).
 
     ``articulated`` holds phi P+ phi* of the nodes that hang on the outermost node beside its path.
     """
@@ -115,7 +115,7 @@ def element(s) -> wp.Kernel:
     @wp.kernel(module=f"warp_spo_scan_articulated_{T.__name__}", enable_backward=False)
     def kernel(
         topology: Topology,
-        stretches: Stretches,
+        path_blocks: PathBlocks,
         level: int,
         pose: wp.array3d[T],
         axis: wp.array3d[T],
@@ -127,12 +127,12 @@ def element(s) -> wp.Kernel:
         J_out: wp.array3d[T],
     ):
         i, world = wp.tid()
-        stretch = level + i
-        first, end = stretches.first[stretch], stretches.first[stretch + 1]
+        path_block = level + i
+        first, end = path_blocks.first[path_block], path_blocks.first[path_block + 1]
         A = wp.identity(n=6, dtype=T)
-        C, J = m.add_branches(vec21(), topology, stretches, stretch, articulated, world), vec21()
+        C, J = m.add_branches(vec21(), topology, path_blocks, path_block, articulated, world), vec21()
         for n in range(first, end):
-            node = stretches.nodes[n]
+            node = path_blocks.nodes[n]
             C += s.articulated(s.load_rigid(rigid, node, world))
             start, count = topology.qd_start[node], topology.dof_count[node]
             for e in range(count):
@@ -146,9 +146,9 @@ def element(s) -> wp.Kernel:
             place = s.load_pose(pose, node, world)
             C = s.articulated_to_parent(place, C)
             A = m.rows_to_parent(place, A)
-        m.store_rows(A_out, stretch, world, A)
-        s.store_articulated(C_out, stretch, world, C)
-        s.store_articulated(J_out, stretch, world, J)
+        m.store_rows(A_out, path_block, world, A)
+        s.store_articulated(C_out, path_block, world, C)
+        s.store_articulated(J_out, path_block, world, J)
 
     return kernel
 
@@ -187,15 +187,15 @@ def pivots(s) -> tuple[wp.Function, wp.Function]:
 
 @functools.cache
 def combine(s) -> wp.Kernel:
-    """One round: put the element ``shift`` stretches further out before each element of a path level.
+    """One round: put the element ``shift`` blocks further out before each element of a path level.
 
-    One thread for each (stretch, world).
+    One thread for each (block, world).
     """
     T, m, largest_pivot, column_of = s.T, matrices(s), *pivots(s)
 
     @wp.kernel(module=f"warp_spo_scan_articulated_{T.__name__}", enable_backward=False)
     def kernel(
-        stretches: Stretches,
+        path_blocks: PathBlocks,
         level: int,
         shift: int,
         A: wp.array3d[T],
@@ -206,14 +206,14 @@ def combine(s) -> wp.Kernel:
         J_out: wp.array3d[T],
     ):
         i, world = wp.tid()
-        stretch = level + i
-        J_j = s.load_articulated(J, stretch, world)
-        if stretches.position[stretch] < shift:
-            m.store_rows(A_out, stretch, world, m.load_rows(A, stretch, world))
-            s.store_articulated(C_out, stretch, world, s.load_articulated(C, stretch, world))
-            s.store_articulated(J_out, stretch, world, J_j)
+        path_block = level + i
+        J_j = s.load_articulated(J, path_block, world)
+        if path_blocks.position[path_block] < shift:
+            m.store_rows(A_out, path_block, world, m.load_rows(A, path_block, world))
+            s.store_articulated(C_out, path_block, world, s.load_articulated(C, path_block, world))
+            s.store_articulated(J_out, path_block, world, J_j)
             return
-        other = stretch - shift
+        other = path_block - shift
         A_i = m.load_rows(A, other, world)
         C_i, J_i = s.load_articulated(C, other, world), s.load_articulated(J, other, world)
         size = m.diagonal(J_j)
@@ -229,28 +229,28 @@ def combine(s) -> wp.Kernel:
             J_i = s.downdate(J_i, g, -D)
             pivot, some = largest_pivot(J_j, size)
             left -= 1
-        A_j = m.load_rows(A, stretch, world)  # no sooner, because registers are few
-        m.store_rows(A_out, stretch, world, A_i * A_j)
-        s.store_articulated(J_out, stretch, world, J_i)
+        A_j = m.load_rows(A, path_block, world)  # no sooner, because registers are few
+        m.store_rows(A_out, path_block, world, A_i * A_j)
+        s.store_articulated(J_out, path_block, world, J_i)
         C_i = m.upper(wp.transpose(A_j) * m.whole(C_i) * A_j)
-        s.store_articulated(C_out, stretch, world, C_i + s.load_articulated(C, stretch, world))
+        s.store_articulated(C_out, path_block, world, C_i + s.load_articulated(C, path_block, world))
 
     return kernel
 
 
 @functools.cache
 def factor(s) -> wp.Kernel:
-    """Factorise the nodes of each stretch of one path level, as ``articulated.factor``, given what comes from outside.
+    """Factorise the nodes of each block of one path level, as ``articulated.factor``, given what comes from outside.
 
-    One thread for each (stretch, world). ``C`` holds P+ of the innermost node of each stretch, in its parent's frame.
-    ``psi_out`` receives psi through the stretch, row-major, as the weight of every stretch that hangs on it.
+    One thread for each (block, world). ``C`` holds P+ of the innermost node of each block, in its parent's frame.
+    ``psi_out`` receives psi through the block, row-major, as the weight of every block that hangs on it.
     """
     T, vec21, m, (keep_sizes, eliminate_dof) = s.T, s.vec21, matrices(s), dof_elimination(s)
 
     @wp.kernel(module=f"warp_spo_scan_articulated_{T.__name__}", enable_backward=False)
     def kernel(
         topology: Topology,
-        stretches: Stretches,
+        path_blocks: PathBlocks,
         level: int,
         pose: wp.array3d[T],
         axis: wp.array3d[T],
@@ -263,15 +263,15 @@ def factor(s) -> wp.Kernel:
         psi_out: wp.array2d[T],
     ):
         i, world = wp.tid()
-        stretch = level + i
-        first, end = stretches.first[stretch], stretches.first[stretch + 1]
+        path_block = level + i
+        first, end = path_blocks.first[path_block], path_blocks.first[path_block + 1]
         psi = wp.identity(n=6, dtype=T)
         P = vec21()
-        if stretches.position[stretch] > 0:
-            P = s.load_articulated(C, stretch - 1, world)
-        P = m.add_branches(P, topology, stretches, stretch, articulated_out, world)
+        if path_blocks.position[path_block] > 0:
+            P = s.load_articulated(C, path_block - 1, world)
+        P = m.add_branches(P, topology, path_blocks, path_block, articulated_out, world)
         for n in range(first, end):
-            node = stretches.nodes[n]
+            node = path_blocks.nodes[n]
             P += s.articulated(s.load_rigid(rigid, node, world))
             start, count, P_0 = topology.qd_start[node], topology.dof_count[node], P
             keep_sizes(P, start, count, world, axis, armature, pivot_out)
@@ -285,8 +285,8 @@ def factor(s) -> wp.Kernel:
             if topology.parent[node] >= 0:
                 P = s.articulated_to_parent(place, P)
                 s.store_articulated(articulated_out, node, world, P)
-        for e in range(stretches.child_start[stretch], stretches.child_start[stretch + 1]):
-            block = 36 * stretches.children[e]
+        for e in range(path_blocks.child_start[path_block], path_blocks.child_start[path_block + 1]):
+            block = 36 * path_blocks.children[e]
             for row in range(6):
                 for column in range(6):
                     psi_out[world, block + 6 * row + column] = psi[column, row]

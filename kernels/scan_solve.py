@@ -1,11 +1,11 @@
-"""Mass^-1 b through stretches: each stretch works twice, before and after it knows what comes in from the others.
+"""Mass^-1 b through blocks: each block works twice, before and after it knows what comes in from the others.
 
-The recursions of ``articulated.eliminate`` and ``articulated.back_substitute`` are linear. Each stretch first works
-with zero coming in; the force or acceleration that leaves it is its entry of x. On the tree of stretches, with the
+The recursions of ``articulated.eliminate`` and ``articulated.back_substitute`` are linear. Each block first works
+with zero coming in; the force or acceleration that leaves it is its entry of x. On the tree of blocks, with the
 weights that ``scan_articulated.factor`` leaves, (I - E)^-1 x or (I - E)^-T x then holds all that comes in, and each
-stretch works once more.
+block works once more.
 
-Vectors of the tree of stretches are [world, 6 stretch + component, column]. The entry of a stretch is the force that
+Vectors of the tree of blocks are [world, 6 block + component, column]. The entry of a block is the force that
 leaves it inward or, outward, the acceleration of the node that it hangs on.
 """
 
@@ -13,14 +13,14 @@ import functools
 
 import warp as wp
 
-from .topology import Stretches, Topology
+from .topology import PathBlocks, Topology
 
 
 @functools.cache
 def eliminate(s) -> wp.Kernel:
     """Inward: z(k) = force(k) + sum over children phi (z + G eps), eps = b - H z; out = D^-1 eps.
 
-    One thread for each (stretch, column, world). Without ``force``, ``b`` or ``incoming`` that is zero, or with
+    One thread for each (block, column, world). Without ``force``, ``b`` or ``incoming`` that is zero, or with
     ``identity`` b is the unit matrix. ``out`` is written with ``incoming``, ``leaving_out`` without.
     """
     T = s.T
@@ -28,7 +28,7 @@ def eliminate(s) -> wp.Kernel:
     @wp.kernel(module=f"warp_spo_scan_solve_{T.__name__}", enable_backward=False)
     def kernel(
         topology: Topology,
-        stretches: Stretches,
+        path_blocks: PathBlocks,
         first_column: int,
         pose: wp.array3d[T],
         axis: wp.array3d[T],
@@ -41,16 +41,16 @@ def eliminate(s) -> wp.Kernel:
         leaving_out: wp.array3d[T],
         out: wp.array3d[T],
     ):
-        stretch, c, world = wp.tid()
+        path_block, c, world = wp.tid()
         column = first_column + c
         z = s.vec6()
         if incoming:
-            for e in range(stretches.child_start[stretch], stretches.child_start[stretch + 1]):
-                row = 6 * stretches.children[e]
+            for e in range(path_blocks.child_start[path_block], path_blocks.child_start[path_block + 1]):
+                row = 6 * path_blocks.children[e]
                 for k in range(6):
                     z[k] += incoming[world, row + k, c]
-        for n in range(stretches.first[stretch], stretches.first[stretch + 1]):
-            node = stretches.nodes[n]
+        for n in range(path_blocks.first[path_block], path_blocks.first[path_block + 1]):
+            node = path_blocks.nodes[n]
             if force:
                 z += s.load_motion(force, node, world)
             start, count = topology.qd_start[node], topology.dof_count[node]
@@ -69,7 +69,7 @@ def eliminate(s) -> wp.Kernel:
             z = s.force_to_parent(s.load_pose(pose, node, world), z)
         if leaving_out:
             for k in range(6):
-                leaving_out[world, 6 * stretch + k, c] = z[k]
+                leaving_out[world, 6 * path_block + k, c] = z[k]
 
     return kernel
 
@@ -78,7 +78,7 @@ def eliminate(s) -> wp.Kernel:
 def back_substitute(s) -> wp.Kernel:
     """Outward: out = D^-1 eps - G* alpha(p), alpha(k) = phi* alpha(p) + H* out.
 
-    One thread for each (stretch, column, world). ``out`` holds D^-1 eps before; it is written with ``incoming``, and
+    One thread for each (block, column, world). ``out`` holds D^-1 eps before; it is written with ``incoming``, and
     ``leaving_out`` without. With ``gravity``, the inertial frame accelerates by -gravity.
     """
     T = s.T
@@ -86,7 +86,7 @@ def back_substitute(s) -> wp.Kernel:
     @wp.kernel(module=f"warp_spo_scan_solve_{T.__name__}", enable_backward=False)
     def kernel(
         topology: Topology,
-        stretches: Stretches,
+        path_blocks: PathBlocks,
         first_column: int,
         pose: wp.array3d[T],
         axis: wp.array3d[T],
@@ -97,22 +97,22 @@ def back_substitute(s) -> wp.Kernel:
         leaving_out: wp.array3d[T],
         out: wp.array3d[T],
     ):
-        stretch, c, world = wp.tid()
+        path_block, c, world = wp.tid()
         column = first_column + c
-        first, end = stretches.first[stretch], stretches.first[stretch + 1]
+        first, end = path_blocks.first[path_block], path_blocks.first[path_block + 1]
         alpha = s.vec6()
-        if stretches.parent[stretch] < 0:
+        if path_blocks.parent[path_block] < 0:
             base = s.base_acceleration(gravity, world)
             if incoming:
                 alpha = base
             else:
                 for k in range(6):
-                    leaving_out[world, 6 * stretch + k, c] = base[k]
+                    leaving_out[world, 6 * path_block + k, c] = base[k]
         elif incoming:
             for k in range(6):
-                alpha[k] = incoming[world, 6 * stretch + k, c]
+                alpha[k] = incoming[world, 6 * path_block + k, c]
         for e in range(end - first):
-            node = stretches.nodes[end - 1 - e]
+            node = path_blocks.nodes[end - 1 - e]
             alpha = s.motion_to_child(s.load_pose(pose, node, world), alpha)
             start = topology.qd_start[node]
             for dof in range(start, start + topology.dof_count[node]):
@@ -122,8 +122,8 @@ def back_substitute(s) -> wp.Kernel:
                 if incoming:
                     out[world, dof, column] = result[0]
         if leaving_out:
-            for e in range(stretches.child_start[stretch], stretches.child_start[stretch + 1]):
-                row = 6 * stretches.children[e]
+            for e in range(path_blocks.child_start[path_block], path_blocks.child_start[path_block + 1]):
+                row = 6 * path_blocks.children[e]
                 for k in range(6):
                     leaving_out[world, row + k, c] = alpha[k]
 

@@ -19,7 +19,7 @@ COMMIT = 'asm volatile("cp.async.commit_group;" ::: "memory");'
 WAIT_FOR_COPIES = 'asm volatile("cp.async.wait_all;" ::: "memory");'
 
 
-class Row(NamedTuple):
+class SharedRow(NamedTuple):
     """An array with one row a world: its name, its number of axes, and the number of entries in a row."""
 
     name: str
@@ -71,13 +71,13 @@ def pitch(entries: int) -> int:
     return entries | 1 if entries % 4 == 0 else entries
 
 
-def source(row: Row, c: str) -> tuple[str, str]:
+def source(row: SharedRow, c: str) -> tuple[str, str]:
     """Return the C type of an array's entries, and C++ for the address of the first one."""
     return ("unsigned char", f"(const unsigned char*){row.name}.data") if row.name in MASKS else (c, f"{row.name}.data")
 
 
 def copy_rows_in(
-    rows: list[Row], offset: dict[str, int], c: str, team: int, direct: bool = False, late: bool = False
+    rows: list[SharedRow], offset: dict[str, int], c: str, team: int, direct: bool = False, late: bool = False
 ) -> str:
     """Return code that copies the rows of arrays to shared memory, each from its scalar ``offset`` on.
 
@@ -95,12 +95,12 @@ def copy_rows_in(
     return "\n".join([DEFINE_ASYNC_COPY, text, WAIT_FOR_COPIES, "#undef ON_ITS_WAY"]) if on_their_way else text
 
 
-def rows_on_their_way(rows: list[Row], direct: bool) -> list[Row]:
+def rows_on_their_way(rows: list[SharedRow], direct: bool) -> list[SharedRow]:
     """Return the rows that are copied without passing through registers."""
     return [row for row in rows if _is_asynchronous(row, direct)]
 
 
-def wait_where_used(statements: str, rows: list[Row]) -> str:
+def wait_where_used(statements: str, rows: list[SharedRow]) -> str:
     """Return the statements of a warp with waits for ``rows``, copied in this order, each before its first use.
 
     A wait is outside of braces, so that all threads of the warp come to it.
@@ -123,12 +123,12 @@ def wait_where_used(statements: str, rows: list[Row]) -> str:
     return "\n".join(found)
 
 
-def _is_asynchronous(row: Row, direct: bool) -> bool:
+def _is_asynchronous(row: SharedRow, direct: bool) -> bool:
     """Return whether a row is copied without passing through registers."""
     return row.name not in MASKS and (row.entries >= LONG_COPY or (direct and row.entries == pitch(row.entries)))
 
 
-def copy_rows_out(out: Row, offset: int, width: int, c: str, team: int) -> str:
+def copy_rows_out(out: SharedRow, offset: int, width: int, c: str, team: int) -> str:
     """Return code that copies rows, ``width`` scalars apart, from shared memory to the array ``out``."""
     n, (vector, _, names) = out.entries, VECTORS[c]
     several = f"(({vector}*)to)[i] = (({vector}*)from)[i];"
@@ -157,7 +157,7 @@ def _run(copies: list[Copy], team: int) -> str:
     )
 
 
-def _copy_in(row: Row, offset: int, c: str, asynchronous: bool) -> Copy:
+def _copy_in(row: SharedRow, offset: int, c: str, asynchronous: bool) -> Copy:
     n, (kind, start), (vector, _, names) = row.entries, source(row, c), VECTORS[c]
     origin, to = f"from_{row.name}", f"to_{row.name}"  # q_from is the name of an array
     padded, to_one = n != pitch(n), f"{to} + {_padded_index('i', n, pitch(n))}"

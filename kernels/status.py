@@ -20,7 +20,8 @@ from .elementary import EPSILON
 from .kinematics import SCREWS
 from .topology import Topology
 
-OK, PIVOT, NOT_FINITE, DIGITS, RANGE = range(5)  # as warp_spo.Status, which kernels cannot import; a test compares
+OK, PIVOT, NOT_FINITE, DIGITS, RANGE, NOT_SETTLED = range(6)
+"""As warp_spo.Status, which kernels cannot import; a test compares."""
 NORMAL = {
     wp.float32: (2.0**-126, 2.0**127),
     wp.float64: (2.0**-1022, 2.0**1023),
@@ -299,15 +300,13 @@ def status_word(s) -> wp.Kernel:
     return kernel
 
 
-OK, NOT_SETTLED = 0, 5  # as warp_spo.Status, which kernels cannot import; a test compares
-
-
 @functools.cache
 def mark_unsettled(T) -> wp.Kernel:
-    """Set the word NOT_SETTLED, where it is OK, unless |rates - found| is at most ``share`` of the largest other rate.
+    """Set NOT_SETTLED in worlds whose final kick changed a rate by more than ``share`` of the largest rate.
 
-    found, rates: after the last round, and after the step. kick: half of what velocity terms add to ``found``; the
-    largest rate is taken of what else they are. All [world, dof].
+    Worlds with another status keep it. ``found`` are the rates after the last iteration, ``rates`` those after the
+    step, ``kick`` is half of what velocity terms add to ``found``; the largest rate is that of ``found`` without both
+    kicks. All are [world, dof].
     """
 
     @wp.kernel(module=f"warp_spo_unsettled_{T.__name__}", enable_backward=False)

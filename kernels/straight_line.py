@@ -16,7 +16,7 @@ from .native import INTEGERS
 from .shared_rows import (
     DEFINE_ASYNC_COPY,
     WAIT_FOR_COPIES,
-    Row,
+    SharedRow,
     copy_rows_in,
     copy_rows_out,
     pitch,
@@ -28,7 +28,7 @@ from .substeps import STATE, hold_state, move_state, repeat_on_cuda, repeat_subs
 
 # shared memory that a block may declare: 48 KiB less the share that Warp uses; more is asked for at the launch
 SHARED_BYTES = 46 * 1024
-COUPLED_BYTES = 220 * 1024  # of a block whose limbs couple pairs of bodies: all that a multiprocessor has
+COUPLED_BYTES = 220 * 1024  # of a block whose segments couple pairs of bodies: all that a multiprocessor has
 WIDE_BYTES = 110 * 1024  # shared memory of a block with long rows, of which two fit into an H100's 228 KiB
 IN_PLACE, STAGED, MAPPED, RELAYED, TILED, DIRECT = "in place", "staged", "mapped", "relayed", "tiled", "direct"
 BY_TABLE = (MAPPED, RELAYED)  # the ways in which a table says which value each entry of a row receives
@@ -36,7 +36,7 @@ OVER = {"velocities_out": "body_f"}  # a result in shared memory, and the row th
 TILE = 8  # worlds in a tile of a TILED result
 
 
-class Result(NamedTuple):
+class ResultLayout(NamedTuple):
     """How a thread writes the result.
 
     Attributes:
@@ -52,7 +52,7 @@ class Result(NamedTuple):
     """
 
     way: str
-    array: Row
+    array: SharedRow
     row: str = ""
     slots: int = 0
 
@@ -83,18 +83,18 @@ class KernelLayout(NamedTuple):
         direct: short rows, too, are copied to shared memory without passing through registers.
         late: the statements of a warp without a team wait for such rows where they first use them.
         repeats: the statements are those of a substep, see :mod:`.substeps`.
-        aside: the number of values that a thread sets aside in shared memory, as ``ASIDE(i)``.
+        spill_slots: the number of values that a thread sets aside in shared memory, as ``ASIDE(i)``.
         near: names and entries of tables that a team copies to shared memory, as ``near_NAME[i]``: loops wait for them.
     """
 
-    rows: list[Row]
+    rows: list[SharedRow]
     staged: bool
     fields: list[str]
-    result: Result
+    result: ResultLayout
     messages: int
     warps: int
     block: int
-    further: tuple[Row, ...] = ()
+    further: tuple[SharedRow, ...] = ()
     further_staged: bool = False
     retries: bool = False
     cached: tuple[tuple[int, ...], ...] = ()
@@ -102,16 +102,16 @@ class KernelLayout(NamedTuple):
     direct: bool = False
     late: bool = False
     repeats: bool = False
-    aside: int = 0
+    spill_slots: int = 0
     near: tuple[tuple[str, int], ...] = ()
 
     @property
-    def state(self) -> list[Row]:
+    def state(self) -> list[SharedRow]:
         """The rows that a substep writes for the next one; in a team, always in shared memory."""
         return [row for row in self.rows if row.name in STATE] if self.repeats else []
 
     @property
-    def shared_rows(self) -> list[Row]:
+    def shared_rows(self) -> list[SharedRow]:
         """The rows that are in shared memory."""
         return self.rows if self.staged else self.state if self.warps > 1 else []
 
@@ -126,7 +126,7 @@ class KernelLayout(NamedTuple):
         rows = sum(pitch(row.entries) for row in self.shared_rows)
         rows += sum(pitch(row.entries) for row in self.staged_further if self.replaced(row) is None)
         rows += pitch(self.result.array.entries) if self.result.way == STAGED else 0
-        scalars = WARP_SIZE * (rows + self.messages + self.warps * self.aside + sum(map(len, self.cached)))
+        scalars = WARP_SIZE * (rows + self.messages + self.warps * self.spill_slots + sum(map(len, self.cached)))
         if self.result.way == RELAYED:
             return max(scalars, self.result.slot_layout.scalars)
         return scalars + (self.result.slot_layout.scalars if self.result.way == MAPPED else 0)
@@ -137,17 +137,17 @@ class KernelLayout(NamedTuple):
         return self.shared_scalars - WARP_SIZE * sum(map(len, self.cached))
 
     @property
-    def staged_further(self) -> tuple[Row, ...]:
+    def staged_further(self) -> tuple[SharedRow, ...]:
         """The further results that go to memory through shared memory."""
         return tuple(row for row in self.apart if self.further_staged and row.name not in INTEGERS)
 
-    def replaced(self, row: Row) -> Row | None:
+    def replaced(self, row: SharedRow) -> SharedRow | None:
         """Return the row in shared memory whose place a further result in shared memory takes, if there is one."""
         rows = (one for one in self.shared_rows if one.name == OVER.get(row.name) and one.entries == row.entries)
         return next(rows, None)
 
     @property
-    def apart(self) -> tuple[Row, ...]:
+    def apart(self) -> tuple[SharedRow, ...]:
         """The further results that do not take the place of a row."""
         return tuple(row for row in self.further if row.name not in [STATE[one.name] for one in self.state])
 
@@ -175,7 +175,7 @@ class _Places:
     Attributes:
         rows: of rows and further results in shared memory, by name.
         result: of the result, and its width for a world; 0, 0 where substeps write the state.
-        messages: of what warps send each other. aside: of what threads set aside.
+        messages: of what warps send each other. spill_slots: of what threads set aside.
     """
 
     def __init__(self, layout: KernelLayout):
@@ -197,7 +197,7 @@ class _Places:
             self.result = at, width
             at += WARP_SIZE * width if result.way in (STAGED, MAPPED) else 0
         self.messages = at
-        self.aside = at + WARP_SIZE * layout.messages
+        self.spill_slots = at + WARP_SIZE * layout.messages
 
 
 def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
@@ -225,11 +225,14 @@ def _cuda_text(layout: KernelLayout, statements: str, T: type) -> list[str]:
     text += _declare_result(layout, places, T)
     if layout.messages:
         text += [f"{c}* sent = stage + {places.messages} + lane;", "#define SENT(i) sent[(i) * 32]"]
-    if layout.aside:  # volatile, because a compiler would keep in a register what it stores
-        text += [f"volatile {c}* aside = stage + {places.aside} + member;", f"#define ASIDE(i) aside[(i) * {team}]"]
+    if layout.spill_slots:  # volatile, because a compiler would keep in a register what it stores
+        text += [
+            f"volatile {c}* aside = stage + {places.spill_slots} + member;",
+            f"#define ASIDE(i) aside[(i) * {team}]",
+        ]
     text += [*([] if layout.cached else define_fields(layout.fields, c)), statements, *_copy_out(layout, places, T)]
     text += ["#undef FIELD"] if layout.cached else []
-    return [*text, *(["#undef ASIDE"] if layout.aside else [])]
+    return [*text, *(["#undef ASIDE"] if layout.spill_slots else [])]
 
 
 def _find_worlds(layout: KernelLayout) -> list[str]:
@@ -274,7 +277,7 @@ def _fetch_tables(layout: KernelLayout, c: str) -> list[str]:
 def _declare_rows(layout: KernelLayout, places: _Places, c: str) -> list[str]:
     """Return the declarations of ``name_row`` of all arrays that are read, and of further results."""
 
-    def in_stage(row: Row) -> str:
+    def in_stage(row: SharedRow) -> str:
         return f"{c}* {row.name}_row = stage + {places.rows[row.name]} + lane * {pitch(row.entries)};"
 
     text = []
@@ -317,7 +320,7 @@ def _declare_result(layout: KernelLayout, places: _Places, T: type) -> list[str]
     return [f"{c}* result_row = stage + {start} + lane * {width};"]
 
 
-def _result_in_memory(result: Result, c: str) -> str:
+def _result_in_memory(result: ResultLayout, c: str) -> str:
     """Return the declaration of ``result_row`` where entries go to memory each by itself."""
     if result.way == TILED:
         return f"{c}* result_row = out.data + world / {TILE} * {result.slots * TILE} + world % {TILE};"
@@ -378,19 +381,19 @@ def assemble_per_world(fields: list[str], statements: str) -> str:
     return "\n".join(text)
 
 
-def _own_row(row: Row, c: str) -> str:
+def _own_row(row: SharedRow, c: str) -> str:
     """Return the declaration of ``name_row``, the row of the thread's own world in an array that is read."""
     kind, first = source(row, c)
     return f"const {kind}* {row.name}_row = {first} + world * {row.entries};"
 
 
-def _own_result(row: Row, c: str) -> str:
+def _own_result(row: SharedRow, c: str) -> str:
     """Return the declaration of ``name_row``, the row of the thread's own world in a further result."""
     kind = "int" if row.name in INTEGERS else c
     return f"{kind}* {row.name}_row = {row.name}.data + world * {row.entries};"
 
 
-def _write_state(row: Row, offset: dict[str, int], c: str, team: int) -> str:
+def _write_state(row: SharedRow, offset: dict[str, int], c: str, team: int) -> str:
     """Return code that writes a row of the state to the result that takes its place."""
     if row.name not in offset:
         return write_state(row, c)

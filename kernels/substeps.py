@@ -4,7 +4,7 @@ On CUDA the state of a world is in shared memory while the loop runs, or in the 
 the CPU it is in the rows of the result. All other rows stay as they are, and are read again.
 """
 
-from .shared_rows import Row
+from .shared_rows import SharedRow
 
 SUBSTEPS = "substeps"  # the name of the number of substeps
 # without it the compiler holds rows that stay in registers from substep to substep, and spills others
@@ -23,26 +23,26 @@ def repeat_on_cuda(statements: str, team: bool) -> str:
     return "\n".join(["#pragma unroll 1", repeat_substeps("\n".join([FENCE, statements, *[SYNC] * team]))])
 
 
-def hold_state(row: Row, c: str) -> str:
+def hold_state(row: SharedRow, c: str) -> str:
     """Return the declaration of ``name_row``, a copy of a row of the state in the thread."""
     read = f"{row.name}_row[i] = {row.name}.data[world * {row.entries} + i];"
     return f"{c} {row.name}_row[{row.entries}];\n#pragma unroll\nfor (int i = 0; i < {row.entries}; ++i) {read}"
 
 
-def write_state(row: Row, c: str) -> str:
+def write_state(row: SharedRow, c: str) -> str:
     """Return code that writes the copy of a row of the state to the result."""
     write = f"{STATE[row.name]}.data[world * {row.entries} + i] = {row.name}_row[i];"
     return f"if (mine) {{\n#pragma unroll\nfor (int i = 0; i < {row.entries}; ++i) {write}\n}}"
 
 
-def move_state(row: Row, c: str) -> str:
+def move_state(row: SharedRow, c: str) -> str:
     """Return the declaration of ``name_row``, the row of the result, to which the state is copied before the loop."""
     name, at = row.name, f"world * {row.entries}"
     copy = f"for (int i = 0; i < {row.entries}; ++i) {name}_row[i] = {name}.data[{at} + i];"
     return f"{c}* {name}_row = {STATE[name]}.data + {at};\nif ({name}_row != {name}.data + {at}) {copy}"
 
 
-def replace_state(row: Row, c: str) -> str:
+def replace_state(row: SharedRow, c: str) -> str:
     """Return the declaration of the result's row in the place of the state's."""
     result = STATE[row.name]
     return f"{c}* {'result' if result == 'out' else result}_row = {row.name}_row;"

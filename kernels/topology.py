@@ -19,13 +19,13 @@ class Topology:
 
 
 @wp.struct
-class Stretches:
-    """The stretches, path by path, from the outermost of a path to the innermost."""
+class PathBlocks:
+    """The blocks, path by path, from the outermost of a path to the innermost."""
 
-    first: wp.array[int]  # [stretch + 1], into nodes
-    nodes: wp.array[int]  # outermost node of a stretch first
-    position: wp.array[int]  # [stretch], stretches further out on its path
-    feed: wp.array[int]  # [stretch], child of its outermost node on its path; -1 where the path begins
-    parent: wp.array[int]  # [stretch], stretch that it hangs on; -1 = the inertial frame
-    child_start: wp.array[int]  # [stretch + 1], into children
-    children: wp.array[int]  # stretches that hang on a stretch
+    first: wp.array[int]  # [block + 1], into nodes
+    nodes: wp.array[int]  # outermost node of a block first
+    position: wp.array[int]  # [block], blocks further out on its path
+    path_child: wp.array[int]  # [block], child of its outermost node on its path; -1 where the path begins
+    parent: wp.array[int]  # [block], block that it hangs on; -1 = the inertial frame
+    child_start: wp.array[int]  # [block + 1], into children
+    children: wp.array[int]  # blocks that hang on a block

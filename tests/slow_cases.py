@@ -59,7 +59,7 @@ SLOW_CASES = (
     "test_spatial_operators.py::test_sweeps_equal_the_dense_resolvent_at_4096_worlds[humanoid-float64]",
     "test_stress.py::test_digits_lost_are_estimated_from_above_and_not_far[float32]",
     "test_torch_rollouts.py::test_gradient_of_a_rollout_is_the_difference[damped_arm-500]",
-    "test_trace_pieces.py::test_results_over_rows_that_warps_share[humanoid-mass_matrix_inverse]",
-    "test_trace_pieces.py::test_warps_meet_at_barriers_alone[humanoid-forward_dynamics]",
-    "test_trace_pieces.py::test_warps_meet_at_barriers_alone[tree20-forward_dynamics]",
+    "test_trace_segments.py::test_results_over_rows_that_warps_share[humanoid-mass_matrix_inverse]",
+    "test_trace_segments.py::test_warps_meet_at_barriers_alone[humanoid-forward_dynamics]",
+    "test_trace_segments.py::test_warps_meet_at_barriers_alone[tree20-forward_dynamics]",
 )

@@ -36,9 +36,9 @@ from .dynamics.dynamics import OPERATIONS as DECLARED
 from .dynamics.operation import AS_WRITTEN
 from .scene.scene import Scene
 from .trials import drop_test, report
-from .trials.inputs import OPERATIONS, TOLERANCE, Inputs, Operation
+from .trials.inputs import OPERATIONS, TOLERANCE, Inputs, TrialCase
 from .trials.memory import check_memory
-from .trials.trial import SAMPLE, Subject, Trial
+from .trials.trial import SAMPLE, Subject, TrialRun
 from .viewing import charts, films
 
 WORLDS = {False: 1024, True: 4096}  # on a CPU, on a GPU
@@ -95,9 +95,11 @@ def main(argv: list[str] | None = None) -> int:
         device = find_device(options.device)
         worlds = options.worlds if options.worlds is not None else WORLDS[device.is_cuda]
         dtypes = ("float32", "float64") if options.dtype == "both" else (options.dtype,)
-        if scene.ties and options.loops == "raise":
+        if scene.constraint_summary and options.loops == "raise":
             ways = "--loops cut, embed or multipliers"
-            raise ValueError(f"{options.robot!r} has {scene.ties}, which --loops raise refuses; pass {ways}")
+            raise ValueError(
+                f"{options.robot!r} has {scene.constraint_summary}, which --loops raise refuses; pass {ways}"
+            )
         if 0 < worlds <= MOST_WORLDS:
             check_memory(scene, worlds, dtypes, SETS[device.is_cuda], device)
         dyns = [Dynamics(scene, worlds, device, dtype, loops=options.loops) for dtype in dtypes]
@@ -107,8 +109,12 @@ def main(argv: list[str] | None = None) -> int:
     title = f"{Path(options.robot).stem}: {scene.body_count} bodies, {scene.dof_count} dof, {worlds} worlds on "
     title += f"{device.alias} ({device.name})" if device.is_cuda else device.alias
     print(title)
-    if scene.ties:
-        print(f"closed by {options.loops}: {scene.ties}" if dyns[0].closed else f"left open: {scene.ties}")
+    if scene.constraint_summary:
+        print(
+            f"closed by {options.loops}: {scene.constraint_summary}"
+            if dyns[0].closed
+            else f"left open: {scene.constraint_summary}"
+        )
     notes = left_out(dyns[0])
     for note in notes:
         print(note)
@@ -244,7 +250,7 @@ def run(dyns: list[Dynamics]) -> Iterator[dict[str, Any]]:
     """Yield a row for each operation and each Dynamics; rows of one operation follow each other.
 
     A row has op, granularity, dtype, worlds, error and least (the largest and the smallest of the compared worlds, see
-    ``Operation.error``), seconds, the median run time of one evaluation of all worlds [s], and range, its 10th and
+    ``TrialCase.error``), seconds, the median run time of one evaluation of all worlds [s], and range, its 10th and
     90th percentiles.
 
     Args:
@@ -259,7 +265,7 @@ def run(dyns: list[Dynamics]) -> Iterator[dict[str, Any]]:
             for subject in subjects:
                 dtype = subject.dyn.dtype.__name__
                 progress.step(f"{operation.name} {dtype}")
-                trial = Trial(subject, operation)
+                trial = TrialRun(subject, operation)
                 timing, error = trial.measure(warm_up=WARM_UP, budget=BUDGET)
                 granularity = operation.granularity(subject.dyn)
                 row = dict(op=operation.name, granularity=granularity, dtype=dtype, worlds=worlds)
@@ -267,7 +273,7 @@ def run(dyns: list[Dynamics]) -> Iterator[dict[str, Any]]:
                 yield row | dict(error=error, least=least, seconds=timing.median, range=(timing.low, timing.high))
 
 
-def comparable(dyn: Dynamics) -> dict[str, Operation]:
+def comparable(dyn: Dynamics) -> dict[str, TrialCase]:
     """Return the operations whose results the dense reference of the open tree describes."""
     if not dyn.closed:
         return OPERATIONS

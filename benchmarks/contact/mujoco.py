@@ -216,7 +216,7 @@ def draw(found: dict[str, Any], path: Path) -> None:
             dashes = "--" if method.endswith("default") else "-"
             axes.plot(x, y, dashes, color=hue, marker="o", markersize=4, label=method)
             names = [f"{1e3 * row['dt']:g} ms" for row in line]
-            points += [charts.Point(*place, hue) for place in zip(x, y, names, strict=True)]
+            points += [charts.ChartPoint(*place, hue) for place in zip(x, y, names, strict=True)]
         axes.set(xlabel="run time of a simulated second of one robot, one CPU core", ylabel="error of the base [mm]")
         axes.set_title("G1 pushed by 4 N s: error against its own run at 0.1 ms")
         axes.legend(loc="upper right")

@@ -29,7 +29,7 @@ import warp_spo as spo
 from warp_spo.env import robots
 
 from ..capabilities import median_replay
-from ..table import process_turns as turns
+from ..table import process_turns
 
 DT, FINE, SECONDS = 5e-3, 1e-4, 0.5
 SAMPLE = 64  # worlds of a run for the error
@@ -242,7 +242,7 @@ def measure(make: Callable[..., Stepper], each: int, name: str, worlds: int, dev
     advance(stepper, round(SECONDS / DT / each), device)
     said, finite = stepper.said(), float(np.isfinite(stepper.base()).all(1).mean())
     if not device.is_cuda:
-        with turns.mine:
+        with process_turns.mine:
             begin = time.perf_counter()
             for _ in range(4):
                 stepper.step()
@@ -266,7 +266,7 @@ class Task(NamedTuple):
     worlds: int | None
 
 
-def work(task: Task, turn: turns.Turn) -> Iterator[dict[str, Any]]:
+def work(task: Task, turn: process_turns.Turn) -> Iterator[dict[str, Any]]:
     """Yield a part of the row of a robot and a solver."""
     warnings.simplefilter("ignore")
     (make, each), device = GROUPS[task.group][1][task.solver], wp.get_device(task.device)
@@ -310,7 +310,7 @@ def main(arguments: list[str] | None = None) -> int:
     rows: dict[tuple[str, str, str], dict[str, Any]] = {}
     for task in tasks:
         rows[task[1:4]] = dict(zip(("group", "robot", "solver"), task[1:4], strict=True))
-    for task, found in turns.take_turns(tasks, work, options.seconds, options.jobs):
+    for task, found in process_turns.take_turns(tasks, work, options.seconds, options.jobs):
         row = rows[task[1:4]]
         if isinstance(found, Exception):  # a peer that cannot run is a row that says why
             row["refused"] = str(found)

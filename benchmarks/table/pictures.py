@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from warp_spo.viewing import charts
-from warp_spo.viewing.charts import Point
+from warp_spo.viewing.charts import ChartPoint
 
 from .evidence import Evidence, usual_worlds
 
@@ -113,7 +113,7 @@ def _points(axes: Any, rows: Sequence[dict], names: Sequence[str]) -> None:
         axes.plot(_range(row), [row["error"]] * 2, color=color, linewidth=1.0, alpha=0.6, zorder=2)
         axes.plot(row["us"], row["error"], marker, color=color, markersize=size, linestyle="",
                   markeredgecolor="white", markeredgewidth=0.6, zorder=4 if ours else 3)  # fmt: skip
-        points.append(Point(row["us"], row["error"], name, color, bold=ours))
+        points.append(ChartPoint(row["us"], row["error"], name, color, bold=ours))
     charts.label_points(axes, points)
 
 
@@ -199,7 +199,7 @@ def scaling(pyplot: Any, evidence: Evidence) -> Any:
     return figure
 
 
-def _sweep(axes: Any, name: str, rows: Sequence[dict]) -> list[Point]:
+def _sweep(axes: Any, name: str, rows: Sequence[dict]) -> list[ChartPoint]:
     """Draw the lines of one sweep; return a name for the line of each scene, where there are several."""
     _, label, title = PANELS[name]
     scenes = list(dict.fromkeys(row["scene"] for row in rows)) if name == "worlds" else [""]
@@ -212,7 +212,7 @@ def _sweep(axes: Any, name: str, rows: Sequence[dict]) -> list[Point]:
             for row in mine:
                 axes.plot([_size(row, name)] * 2, _range(row), color=color, linewidth=THICK, alpha=0.4, zorder=1)
             if scene and op == MAIN:
-                ends.append(Point(*points[min(2, len(points) - 1)], _title(mine[0]), color))
+                ends.append(ChartPoint(*points[min(2, len(points) - 1)], _title(mine[0]), color))
     sizes, times = [_size(row, name) for row in rows], [row["us"] for row in rows]
     charts.log_axis(axes.xaxis, sizes, charts.count_text, most=4)
     charts.log_axis(axes.yaxis, times, charts.time_text, most=4)

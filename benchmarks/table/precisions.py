@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import warp_spo as spo
-from warp_spo.trials.inputs import OPERATIONS, TOLERANCE, Inputs, Operation
+from warp_spo.trials.inputs import OPERATIONS, TOLERANCE, Inputs, TrialCase
 from warp_spo.trials.trial import Subject
 
 HEADLINE = ("forward_dynamics", "inverse_dynamics", "mass_matrix", "solve_mass_matrix")
@@ -26,7 +26,7 @@ class Precision:
     """
 
     subject: Callable[..., Subject]
-    operations: dict[str, Operation]
+    operations: dict[str, TrialCase]
     tolerance: float
     scalar: str | None
 

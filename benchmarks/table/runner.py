@@ -22,7 +22,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.reference.dense import Dense
 from warp_spo.trials.inputs import OPERATIONS, Inputs
-from warp_spo.trials.trial import Trial
+from warp_spo.trials.trial import TrialRun
 
 from . import roofline
 from .cases import FACTORIES, case_name
@@ -57,7 +57,7 @@ def run(
       the timed run; NaN if any is;
     * ``backward_error``: the largest one, where the result solves an equation;
     * ``reference``: "dense", or "float64" for the float64 recursions;
-    * ``compile_s``: seconds of the first call, see ``Trial``;
+    * ``compile_s``: seconds of the first call, see ``TrialRun``;
     * ``launches``, and on CUDA ``registers`` and ``local_bytes`` of a thread, the largest of all kernels;
     * ``granularity``, whether the plan has ``chosen`` it, and sizes of the scene.
 
@@ -79,7 +79,7 @@ def run(
 def compile_only(cases: Iterable[dict], device: Any = None) -> None:
     """Compile the kernels of each case into Warp's cache, by evaluating it once."""
     for case, subject, _ in _subjects_of(cases, device, 1):
-        Trial(subject, PRECISIONS[case["dtype"]].operations[case["op"]], 1)
+        TrialRun(subject, PRECISIONS[case["dtype"]].operations[case["op"]], 1)
 
 
 def _subjects_of(cases: Iterable[dict], device: Any, sets: int) -> Iterator[tuple[dict, Any, str]]:
@@ -130,7 +130,7 @@ def _measure(
     if reference != "dense":  # there is no matrix to compute a residual with
         operation = dataclasses.replace(operation, solves=None)
     with record_launches() as launched:
-        trial = Trial(subject, operation, case["sample"])
+        trial = TrialRun(subject, operation, case["sample"])
         del launched[:]  # launches that only the first call makes do not count
         trial.evaluate(0)
     row = dict(bodies=dyn.scene.body_count, dof=dyn.scene.dof_count, depth=dyn.scene.tree.depth)
@@ -154,7 +154,7 @@ def _measure(
     return row
 
 
-def _rates(case: dict, trial: Trial, scalar: str | None, seconds: float, roof: roofline.Roof | None) -> dict:
+def _rates(case: dict, trial: TrialRun, scalar: str | None, seconds: float, roof: roofline.Roof | None) -> dict:
     """Return operations and bytes of a case, their rates, and the share of the roof."""
     row: dict = {}
     operations = roofline.operations(trial.subject.dyn, case["op"]) if scalar else None

@@ -142,7 +142,7 @@ def test_names_do_not_hide_each_other(pyplot):
     charts.log_axis(axes.xaxis, [1.0, 100.0], charts.time_text)
     charts.log_axis(axes.yaxis, [1.0, 100.0], charts.power_text)
     charts.finish_layout(figure)
-    charts.label_points(axes, [charts.Point(x, x, f"library {x:.2f}", charts.OURS) for x in values])
+    charts.label_points(axes, [charts.ChartPoint(x, x, f"library {x:.2f}", charts.OURS) for x in values])
     renderer = figure.canvas.get_renderer()
     boxes = [text.get_window_extent(renderer) for text in axes.texts]
     frame = axes.get_window_extent(renderer).padded(1.0)

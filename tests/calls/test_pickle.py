@@ -17,7 +17,7 @@ import warp_spo as spo
 from support import custom_hinges, laws, mechanisms, zoo
 from support.border import explained
 from support.solver_models import turned_model
-from warp_spo.dynamics import pickling as storage
+from warp_spo.dynamics import pickling
 from warp_spo.torch import Module
 
 WORLDS = 3
@@ -137,7 +137,7 @@ def test_dynamics_keeps_its_options():
 
 def test_a_device_that_is_not_here(changed):
     build, arguments = changed.__reduce__()
-    assert build is storage.build
+    assert build is pickling.build
     arguments[2]["device"] = "cuda:77"
     with explained(ValueError, "Dynamics", "'cuda:77'", "expected", "'cpu'", "device="):
         build(*arguments)

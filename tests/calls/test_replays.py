@@ -272,7 +272,7 @@ def wrong_calls(dyn, threads, calls, kind):
             for i in range(calls):
                 name = THREADED[(i + number) % len(THREADED)]
                 found = leaves(getattr(dyn, name)(**a[number][name]))
-                with dyn._replays.turn.lock:  # reading a Warp array changes the device's current stream for a while
+                with dyn._replays.call_order.lock:  # reading a Warp array changes the current stream
                     got = [numbers(x) for x in found]
                 same = [np.array_equal(x, y) for x, y in zip(got, wanted[number][name], strict=True)]
                 wrong.extend([] if all(same) else [name])

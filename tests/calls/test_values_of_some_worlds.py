@@ -14,7 +14,7 @@ from support.border import made
 from support.gradients import check
 from support.step_scenes import TOLERANCE, H
 from support.value_scenes import KINDS
-from warp_spo.kernels import row_copies as rows
+from warp_spo.kernels import row_copies
 from warp_spo.reference.dense import Dense
 
 WORLDS = 3
@@ -143,9 +143,9 @@ def test_a_tensor_with_gradient_is_not_overwritten_in_some_worlds():
 def test_what_a_thread_copies_on_cuda(transposed, monkeypatch):
     """An entry of each array, run on the CPU: all worlds, some of them, and rows that all worlds share."""
     name = "TRANSPOSED" if transposed else "AS_THEY_ARE"
-    monkeypatch.setattr(rows, name, getattr(rows, name).replace("defined(__CUDA_ARCH__)", "1"))
+    monkeypatch.setattr(row_copies, name, getattr(row_copies, name).replace("defined(__CUDA_ARCH__)", "1"))
     types = (wp.float64, wp.float32) if transposed else (wp.float32, wp.float64)
-    kernel, rng = rows.copy.__wrapped__(*types, 2, transposed), np.random.default_rng(0)
+    kernel, rng = row_copies.copy.__wrapped__(*types, 2, transposed), np.random.default_rng(0)
     given = [rng.normal(size=(WORLDS, 7)).astype(np.float32), rng.normal(size=(1, 2)).astype(np.float32)]
     sources = [wp.array(x, dtype=types[0], device="cpu") for x in given]
     for mask in (None, MASK):

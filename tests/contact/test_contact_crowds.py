@@ -10,8 +10,8 @@ from support import symbolic
 from support.contact_cases import box, quadruped
 from support.step_calls import bundled
 from warp_spo.kernels import native
-from warp_spo.recursions.contact import contact_culling as crowds
-from warp_spo.recursions.model import shared_constants as alike
+from warp_spo.recursions.contact import contact_culling
+from warp_spo.recursions.model import shared_constants
 
 SKIP = re.compile(r"if \(\w+ != 0\) \{")
 REPORTS = {"contact_f": 3, "contact_gap": 1, "contact_slip": 1}
@@ -86,8 +86,8 @@ def test_a_robot_that_is_thrown(monkeypatch, device, dtype):
 
 
 BUGS = {
-    "turning forgotten": (crowds.Crowd, "may_touch", "(v + self.reach * w)", "v"),
-    "points forgotten": (crowds, "gather", "one.depth for one in some", "one.depth for one in some[:1]"),
+    "turning forgotten": (contact_culling.CullGroup, "may_touch", "(v + self.reach * w)", "v"),
+    "points forgotten": (contact_culling, "group_points", "one.depth for one in some", "one.depth for one in some[:1]"),
 }
 
 
@@ -143,8 +143,8 @@ def test_limbs_of_one_make(monkeypatch, device, kind, axes):
     scene, found, texts = two_limbs(kind, **axes), [], []
     q, qd = thrown(scene, 16)
     q[:, 7:], q[:, 2] = np.tile(scene.neutral_q[7:], (16, 1)), q[:, 2] * 0.5
-    differing = alike.differing
-    monkeypatch.setattr(alike, "differing", lambda *given: texts.append(differing(*given)) or texts[-1])
+    differing = shared_constants.find_differing
+    monkeypatch.setattr(shared_constants, "find_differing", lambda *given: texts.append(differing(*given)) or texts[-1])
     for granularity in ("tree", "segment"):
         dyn = spo.Dynamics(scene, 16, device=device, dtype="float64", granularity=granularity)
         force = np.zeros((16, len(scene.contact_points), 3))

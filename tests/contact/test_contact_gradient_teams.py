@@ -14,7 +14,7 @@ from warp_spo.dynamics.stepping import contact_gradients as kernels
 from warp_spo.dynamics.stepping.step import STEP
 from warp_spo.recursions.contact.velocity_kicks import KICK, PATH, START
 from warp_spo.recursions.derivatives.contact import INERTIA, PassGradient, PassSolve, divides
-from warp_spo.recursions.derivatives.contact_pass import weighed_pieces
+from warp_spo.recursions.derivatives.contact_pass import weighed_segments
 from warp_spo.reference.dense import Dense
 
 H, WORLDS, PASSES = 5e-3, 4, 2
@@ -80,7 +80,7 @@ def test_limbs_share_gradients(monkeypatch):
 def test_limbs_share_gradients_where_velocity_terms_are_kicks(monkeypatch, scene):
     """The waist and the arm of the second scene carry limbs, and feel their inertia."""
     trace = contact_gradients.trace_of(scene, ("q", "qd", "tau", "dt", "passes", START, KICK, PATH))
-    assert len(weighed_pieces(trace)) == (0 if scene.body_count == 13 else 2)
+    assert len(weighed_segments(trace)) == (0 if scene.body_count == 13 else 2)
     assert_right(monkeypatch, scene, (*WRT, START, KICK, PATH, "joint_target_ke"), kicked=True)
 
 
@@ -136,15 +136,15 @@ BUGS = {
     "what a limb hands on": (
         PassGradient,
         "stores",
-        'trace.receive("G", piece)[: len(self.passed_on)]',
+        'trace.receive("G", segment)[: len(self.passed_on)]',
         "[0.0] * len(self.passed_on)",
     ),
     "what points on the trunk hand on": (PassGradient, "_carry", "if link is not self._under:", "if True:"),
     "how inertias count": (
         PassSolve,
         "_tell",
-        'trace.send("Q", piece, ways)',
-        'trace.send("Q", piece, [0.0] * len(ways))',
+        'trace.send("Q", segment, gradients)',
+        'trace.send("Q", segment, [0.0] * len(ways))',
     ),
     "how inertias count in memory": (
         PassGradient,

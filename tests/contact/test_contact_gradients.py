@@ -101,10 +101,15 @@ def test_any_number_of_passes_is_differentiated(passes):
 
 BUGS = {
     "earlier passes frozen": (PassAdjoint, "_results", "self._of_later(COTANGENT, self._dofs + item.index[0])", "0.0"),
-    "what passes begin with": (PassGradient, "stores", "select(kept.first, way, 0.0)", "0.0"),
+    "what passes begin with": (PassGradient, "stores", "select(pass_variables.first, gradient, 0.0)", "0.0"),
     "a load held": (PassGradient, "stores", "seeds += [1.0,", "seeds += [0.0,"),
     "a load held before": (PassSolve, "stores", "[*seeds, 1.0]", "[*seeds, 0.0]"),
-    "dampers left out": (PassSolve, "stores", "trace.stiffened = self._with_resistance", "trace.dampers = {}"),
+    "dampers left out": (
+        PassSolve,
+        "stores",
+        "trace.with_step_armature = self._with_resistance",
+        "trace.contact_inertia = {}",
+    ),
     "points that do not press": (PassSolve, "stores", "Vector(wrenches[6 * at", "0.0 * Vector(wrenches[6 * at"),
 }
 

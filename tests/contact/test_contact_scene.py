@@ -11,7 +11,7 @@ from support.contact_cases import box, quadruped
 from warp_spo.dynamics.stepping.integrators import CONTACT_STEP
 from warp_spo.execution.builder import Builder
 from warp_spo.reference.dense import Dense
-from warp_spo.scene.contacts import Stand
+from warp_spo.scene.contacts import NeutralPose
 
 
 def of(body=0, **contact):
@@ -39,7 +39,7 @@ def test_points_of_every_shape():
 
 def test_a_neutral_stand_is_the_dense_pose():
     scene = zoo.random_tree(9, 4)
-    found, dense = Stand(scene), Dense(scene, scene.neutral_q)
+    found, dense = NeutralPose(scene), Dense(scene, scene.neutral_q)
     np.testing.assert_allclose(found.places, dense.body_matrix, atol=1e-12)
 
 

@@ -12,10 +12,8 @@ from support.contact_cases import box, everywhere, quadruped, touching
 from support.contact_steps import FIELDS, H, above, assert_is_dense, by_point
 from support.step_calls import bundled
 from support.step_scenes import furnished, states
-from warp_spo.dynamics.stepping import contact_options as contacts
-from warp_spo.recursions.contact import dampers, ground, law, points, step
-from warp_spo.recursions.contact import secant_laws as secants
-from warp_spo.recursions.contact import velocity_kicks as middle
+from warp_spo.dynamics.stepping import contact_options
+from warp_spo.recursions.contact import dampers, ground, law, points, secant_laws, step, velocity_kicks
 from warp_spo.reference.contact import ContactStep
 
 WORLDS = 4
@@ -204,23 +202,24 @@ def test_a_ground_that_is_not_there_is_an_error(values, words):
 
 
 BUGS = {
-    "active set": (secants.Secant, "finish", "bound * reciprocal(share), 1.0", "0.0, 1.0"),
-    "candidates frozen": (law, "finish_point", "select(touch.candidate, touch.candidate, reached)",
-                          "touch.candidate"),
+    "active set": (secant_laws.SecantLaw, "finish", "bound * reciprocal(share), 1.0", "0.0, 1.0"),
+    "candidates frozen": (law, "finish_point", "select(state.candidate, state.candidate, reached)",
+                          "state.candidate"),
     "dampers above ground": (law, "finish_point", "candidate * pushes", "pushes"),
-    "last pass opens": (law, "finish_point", "closing * touch.closed", "0.0"),
+    "last pass opens": (law, "finish_point", "closing * state.closed", "0.0"),
     "wrong lever": (dampers, "_mass", "r * weight", "r * (2.0 * weight)"),
     "riser unseen": (ground, "surfaces", "_cell((x + moves[0] - ground.origin[0]) * rate_x, rows)[0]", "i"),
-    "velocity terms of the path alone": (middle, "_kick", "forces.__getitem__", "zero"),
-    "rates of the last round": (middle, "last_kick", "2.0 * (kick[dof] - kicked(dof))", "0.0"),
+    "velocity terms of the path alone": (velocity_kicks, "_kick", "forces.__getitem__", "zero"),
+    "rates of the last round": (velocity_kicks, "final_kick",
+                                     "2.0 * (kick[dof] - previous_kick(dof))", "0.0"),
     "points along other rates": (points, "place_points", "w, v = mine.travel", "w, v = mine.twist"),
-    "forces at the start": (step.ContactStep, "__init__", 'trace.instead.pop("q", None)', "None"),
+    "forces at the start": (step.ContactStepTrace, "__init__", 'trace.substitutes.pop("q", None)', "None"),
     "points half way": (points, "place_points", "depth + (0.5 * h)", "depth + (0.4 * h)"),
-    "weights of the neutral pose": (step.ContactStep, "_step_over_inertia", "not in single_dofs", "in single_dofs"),
+    "weights of the neutral pose": (step.ContactStepTrace, "_step_over_inertia", "not in single_dofs", "in single_dofs"),
     "straight paths": (points, "place_points", "(0.5 * h) * faster", "0.0"),
     "damper of straight paths": (points, "place_points", "k * below - damping * faster", "k * below"),
     "damping that does not grow": (points, "place_points", "d * (k * select(less(0.0, depth), depth, 0.0))", "d"),
-    "tangent friction": (law, "secant", "inverse_root(w * w + point.eps * point.eps)",
+    "tangent friction": (law, "friction_damper", "inverse_root(w * w + point.eps * point.eps)",
                          "inverse_root(w * w + point.eps * point.eps) * inverse_root(w * w + point.eps * point.eps)"
                          " * point.eps"),
 }  # fmt: skip
@@ -368,7 +367,7 @@ def test_scenes_without_a_kernel_have_names(device, monkeypatch):
     q, qd = np.array([[0, 0, 1, 0, 0, 0, 1]], np.float32), np.zeros((1, 6), np.float32)
     with pytest.raises(spo.UnsupportedError, match="granularity='node' with contacts"):
         spo.Dynamics(box(), device=device, granularity="node").step(q, qd, None, H)
-    monkeypatch.setitem(contacts.MOST_HEIGHTS, "float32", 600)
+    monkeypatch.setitem(contact_options.MOST_HEIGHTS, "float32", 600)
     with pytest.raises(spo.UnsupportedError, match="a HeightField of 600 points in float32"):
         spo.Dynamics(box(ground=FIELDS["stairs"]), device=device).step(q, qd, None, H)
     bare = spo.Dynamics(box().with_contacts([]), device=device)

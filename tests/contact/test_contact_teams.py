@@ -15,9 +15,8 @@ from support.contact_steps import FIELDS, above, assert_is_dense, steps
 from support.step_scenes import furnished, states
 from warp_spo.dynamics.stepping.integrators import CONTACT_STEP
 from warp_spo.execution import plan
-from warp_spo.execution.segment import warp_specialized as teams
-from warp_spo.kernels import pass_loops
-from warp_spo.kernels import straight_line as straight
+from warp_spo.execution.segment import warp_specialized
+from warp_spo.kernels import pass_loops, straight_line
 from warp_spo.kernels.substeps import repeat_on_cuda
 from warp_spo.recursions.contact import points, step
 from warp_spo.recursions.contact.step import REPORTS
@@ -68,7 +67,7 @@ def text_of(monkeypatch, name, staged=False, reports=REPORTS, status=True, **num
     """The CUDA text of a step with all reports, a state, and what the step by a whole tree gives."""
     for limit in ("FEW_WORLDS", "LONG_ROWS") if staged else ():
         monkeypatch.setattr(plan, limit, 0)
-    monkeypatch.setattr(straight, "SHARED_BYTES", 1 << 20)
+    monkeypatch.setattr(straight_line, "SHARED_BYTES", 1 << 20)
     texts, (scene, a) = warp_machine.recorded(monkeypatch), case(name)
     if not staged:
         a.pop("body_f", None)  # long rows always come through shared memory
@@ -216,11 +215,11 @@ def test_mirrored_legs_share_one_text():
 
 BUGS = {
     "a point that nobody takes": (points, "points_of", "first * each", "(first + 1) * each"),
-    "a point that two take": (points, "points_of", "mine[each * len(piece.children) :]", "mine"),
-    "what a message leaves out": (Trace, "add_contacts", "z - self.pushes[key]", "z"),
-    "excess of one limb": (step.ContactStep, "_sent_to_the_first", "largest(list(values))", "values[0]"),
+    "a point that two take": (points, "points_of", "mine[each * len(segment.children) :]", "mine"),
+    "what a message leaves out": (Trace, "add_contacts", "z - self.contact_force[key]", "z"),
+    "excess of one limb": (step.ContactStepTrace, "_sent_to_the_first", "largest(list(values))", "values[0]"),
     "no barrier after the passes": (pass_loops, "count_team_passes", '"}", barrier]', '"}"]'),
-    "no barrier ahead": (teams.Team, "_ahead", "[BARRIER] if stage else []", "[]"),
+    "no barrier ahead": (warp_specialized.WarpSpecializedKernel, "_ahead", "[BARRIER] if stage else []", "[]"),
 }
 
 

@@ -9,9 +9,8 @@ from support.pair_motions import momentum, stand
 from support.pair_scenes import WEDGE, box, cube, free, stack, stacked, stepped
 from support.pair_steps import assert_is_dense
 from support.pair_touches import hull_of, planted, touches_found
-from warp_spo.kernels import hull_clipping as hull_faces
-from warp_spo.kernels import narrow_phase as touches
-from warp_spo.reference import body_contact as reference_pairs
+from warp_spo.kernels import hull_clipping, narrow_phase
+from warp_spo.reference import body_contact
 from warp_spo.reference.rotations import homogeneous
 
 PRISM = np.array([[0.07 * np.cos(a), 0.05 * np.sin(a), z] for a in np.arange(6) * np.pi / 3.0 for z in (-0.04, 0.05)])
@@ -22,11 +21,11 @@ def touched(device, shapes, poses):
     both = [hull_of(points) for points in shapes]
     rows = np.array([[*middle, 0, 0, 0, 1, *np.ptp(hull.corners, axis=0) / 2.0, 0] for hull, middle in both])
     for pose, points in zip(poses, touches_found(device, poses, (2, 3), rows, shapes, most=16), strict=True):
-        points = points[points[:, 6] > touches.AWAY]
+        points = points[points[:, 6] > narrow_phase.AWAY]
         points[:, :3] += pose[0, :3]
         solids = [(2, homogeneous(at) @ homogeneous(row[:7]), hull.corners, 0.0)
                   for at, row, (hull, _) in zip(pose, rows, both, strict=True)]  # fmt: skip
-        yield points, np.array([[*point, *n, depth] for point, n, depth in reference_pairs.touches(*solids)])
+        yield points, np.array([[*point, *n, depth] for point, n, depth in body_contact.touches(*solids)])
 
 
 def assert_same(found, wanted):
@@ -62,7 +61,7 @@ def test_cubes_as_hulls_share_what_boxes_share(device):
         poses := near(np.random.default_rng(1), 100, 0.05), touched(device, (CUBE, CUBE), poses), strict=True
     ):
         boxes = [(1, homogeneous(at), np.full(3, 0.05), 0.0) for at in pose]
-        wanted = np.array([[*point, *n, depth] for point, n, depth in reference_pairs.faces(*boxes)]).reshape(-1, 7)
+        wanted = np.array([[*point, *n, depth] for point, n, depth in body_contact.faces(*boxes)]).reshape(-1, 7)
         assert_same(found, wanted)
 
 
@@ -79,7 +78,7 @@ BUGS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("bug", BUGS)
 def test_a_planted_bug_of_faces_is_seen(monkeypatch, device, bug):
-    with planted(monkeypatch, hull_faces, *BUGS[bug]), pytest.raises(AssertionError):
+    with planted(monkeypatch, hull_clipping, *BUGS[bug]), pytest.raises(AssertionError):
         test_points_of_two_hulls_are_those_of_the_reference(device, (WEDGE, TETRAHEDRON))
 
 

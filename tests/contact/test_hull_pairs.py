@@ -14,10 +14,10 @@ from support.hull_scenes import CAN, CUBE, LAW, TETRAHEDRON
 from support.pair_scenes import WEDGE, cube, free, stepped
 from support.pair_steps import assert_is_dense, respond_by_whole_trees
 from support.pair_touches import hull_of, planted, touches_found
-from warp_spo.kernels import hull_distance as hulls
-from warp_spo.reference import body_contact as reference_pairs
+from warp_spo.kernels import hull_distance
+from warp_spo.reference import body_contact
 from warp_spo.reference.rotations import homogeneous
-from warp_spo.scene.collision_shapes import reduced
+from warp_spo.scene.collision_shapes import reduce_points
 from warp_spo.scene.hulls import MOST
 
 
@@ -54,7 +54,7 @@ def test_flat_and_long_hulls_keep_all_corners_on_the_ground(monkeypatch):
         wanted = cloud[np.sort(ConvexHull(cloud).vertices)]
         np.testing.assert_array_equal(spo.Contact(0, hull=cloud).positions, wanted)
         few = cloud[:10]
-        np.testing.assert_array_equal(reduced(few, 16), np.sort(ConvexHull(few).vertices))  # of a file's mesh
+        np.testing.assert_array_equal(reduce_points(few, 16), np.sort(ConvexHull(few).vertices))  # of a file's mesh
     monkeypatch.setattr("warp_spo.scene.contacts.AT_ONCE", 1000)
     np.testing.assert_array_equal(spo.Contact(0, hull=cloud).positions, wanted)
 
@@ -160,7 +160,7 @@ def check_points(device, corners, places):
             np.testing.assert_allclose(at[i], nearest - 0.5 * depth[i] * normal[i], atol=1e-9)
             np.testing.assert_allclose(np.linalg.norm(normal[i]), 1.0, atol=1e-12)
             if i % 4 == order and len(corners) <= 8:
-                ours, out = reference_pairs.out_of_hull(local, np.asarray(corners))
+                ours, out = body_contact.out_of_hull(local, np.asarray(corners))
                 np.testing.assert_allclose([ours, *(ours * out)], [distance, *(local - nearest)], atol=1e-9)
         assert 4 <= inside < len(places) - 15
 
@@ -177,7 +177,7 @@ BUGS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("bug", BUGS)
 def test_a_planted_bug_of_hulls_is_seen(monkeypatch, device, bug):
-    with planted(monkeypatch, hulls, *BUGS[bug]), pytest.raises(AssertionError):
+    with planted(monkeypatch, hull_distance, *BUGS[bug]), pytest.raises(AssertionError):
         test_points_of_a_hull_are_the_nearest_ones(device)
 
 

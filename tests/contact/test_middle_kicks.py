@@ -7,10 +7,9 @@ import warp as wp
 import warp_spo as spo
 from support import contact_cases, symbolic, warp_machine
 from support.contact_cases import quadruped, waisted
-from warp_spo.dynamics.stepping import midpoint_contact as rounds
-from warp_spo.recursions.contact import step
-from warp_spo.recursions.contact import velocity_kicks as middle
-from warp_spo.recursions.contact.velocity_kicks import FOUND, GAINED, KICKED, PATH
+from warp_spo.dynamics.stepping import midpoint_contact
+from warp_spo.recursions.contact import step, velocity_kicks
+from warp_spo.recursions.contact.velocity_kicks import PASS_ACCELERATION, PATH, PREVIOUS_KICK, PREVIOUS_RATES
 from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.model.tracing import Trace
 from warp_spo.reference.dense import Dense
@@ -54,7 +53,7 @@ def smooth(scene, q, qd, h, count=2):
     return qd
 
 
-def errors(scene, h, compute=symbolic.contact_step_in_rounds, passes=4):
+def errors(scene, h, compute=symbolic.midpoint_contact_step, passes=4):
     """The largest error of a rate after one step, by world."""
     a = flying(scene)
     found = compute(scene, a, h, passes)["out"]
@@ -75,9 +74,9 @@ def test_rates_are_of_second_order():
 
 
 BUGS = {
-    "rounds that forget": (middle, "_kick", "0.5 * (qd(dof) + found(dof))", "found(dof)"),
-    "one kick": (step.ContactStep, "_after", "rates[dof] + self.kick(dof)", "rates[dof]"),
-    "velocity terms at the start": (middle, "_kick", '"q": there.__getitem__, ', ""),
+    "rounds that forget": (velocity_kicks, "_kick", "0.5 * (qd(dof) + previous_rates(dof))", "previous_rates(dof)"),
+    "one kick": (step.ContactStepTrace, "_after", "rates[dof] + self.kick(dof)", "rates[dof]"),
+    "velocity terms at the start": (velocity_kicks, "_kick", '"q": there.__getitem__, ', ""),
 }
 
 
@@ -130,15 +129,15 @@ def test_the_acceleration_is_that_of_the_whole_step(device):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("routine", [rounds.MIDDLE_KICK, rounds.LAST_KICK], ids=["middle", "last"])
+@pytest.mark.parametrize("routine", [midpoint_contact.FIRST_KICK, midpoint_contact.FINAL_KICK], ids=["middle", "last"])
 @pytest.mark.parametrize("scene", [quadruped(contact_cases.EFFORT), waisted()], ids=["quadruped", "waisted"])
 def test_limbs_share_kicks(scene, routine, monkeypatch):
     """Code of a GPU, run by threads in both orders, finds what the whole tree finds."""
     rng, n, texts = np.random.default_rng(0), scene.dof_count, warp_machine.recorded(monkeypatch)
-    given = flying(scene) | {name: 20.0 * rng.normal(size=(WORLDS, n)) for name in (FOUND, KICKED)}
+    given = flying(scene) | {name: 20.0 * rng.normal(size=(WORLDS, n)) for name in (PREVIOUS_RATES, PREVIOUS_KICK)}
     options, shapes = {}, {"out": (n,), "q_out": (scene.coord_count,), f"{PATH}_out": (n,)}
-    if routine is rounds.LAST_KICK:
-        given, options = given | {GAINED: rng.normal(size=(WORLDS, n))}, {"qdd": True}
+    if routine is midpoint_contact.FINAL_KICK:
+        given, options = given | {PASS_ACCELERATION: rng.normal(size=(WORLDS, n))}, {"qdd": True}
         shapes = {"out": (n,), "qdd_out": (n,)}
     known = given | {"dt": np.full((WORLDS, 1), H)}
     wanted = {name: np.full((WORLDS, *shape), np.nan) for name, shape in shapes.items()}

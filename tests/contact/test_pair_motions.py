@@ -7,8 +7,7 @@ import warp_spo as spo
 from support.pair_motions import largest_rise, momentum, stand
 from support.pair_scenes import H, cube, cubes_in_a_row, free, stack, stacked, stepped
 from warp_spo.examples import grasp
-from warp_spo.kernels import coupling
-from warp_spo.kernels import straight_line as straight
+from warp_spo.kernels import coupling, straight_line
 from warp_spo.recursions.contact import coupled, pair_pieces
 from warp_spo.reference.body_contact import PairStep
 
@@ -41,8 +40,8 @@ def test_a_collision_keeps_momentum(device):
 
 def test_every_array_of_a_thread_has_entries(device, monkeypatch):
     """Also where no hinge has a law with bounds; compilers for CUDA refuse an array without entries."""
-    texts, assemble = [], straight.assemble
-    monkeypatch.setattr(straight, "assemble", lambda *given: texts.append(assemble(*given)) or texts[-1])
+    texts, assemble = [], straight_line.assemble
+    monkeypatch.setattr(straight_line, "assemble", lambda *given: texts.append(assemble(*given)) or texts[-1])
     head_on("float64", device, granularity="tree")
     assert any("couples::judge" in text for text in texts) and not any("[0] = {}" in text for text in texts)
 

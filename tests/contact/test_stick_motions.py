@@ -8,7 +8,7 @@ from support.hull_scenes import RAMP, SLOPE
 from support.pair_motions import largest_rise, momentum, stand
 from support.pair_scenes import H, cube, free
 from support.pair_touches import assert_points_are_those_of_the_reference, planted
-from warp_spo.kernels import segment_convex as sticks
+from warp_spo.kernels import segment_convex
 
 LAW = dict(stiffness=1e5, damping=300.0)
 STICK = dict(capsule=((-0.2, 0.0, 0.0), (0.2, 0.0, 0.0), 0.03))
@@ -55,7 +55,7 @@ BUGS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("bug", BUGS)
 def test_a_planted_bug_of_sticks_is_seen(monkeypatch, device, bug):
-    with planted(monkeypatch, sticks, *BUGS[bug], text="IN_BOX"), pytest.raises(AssertionError):
+    with planted(monkeypatch, segment_convex, *BUGS[bug], text="IN_BOX"), pytest.raises(AssertionError):
         assert_points_are_those_of_the_reference(device, (0, 1), long=True)
 
 

@@ -21,7 +21,7 @@ from warp_spo.recursions import (
 )
 from warp_spo.reference.dense import Dense
 from warp_spo.trials.inputs import APPLICATIONS, Inputs
-from warp_spo.trials.trial import Subject, Trial
+from warp_spo.trials.trial import Subject, TrialRun
 
 WORLDS = 3
 TOLERANCE = {"float64": 1e-12, "float32": 3e-5}  # cond(M) of the worst scene is 1e4
@@ -317,7 +317,7 @@ def test_robots(name, dtype, device):
     scene = robots.ROBOTS[name]()
     dyn = spo.Dynamics(scene, 256, device=device, dtype=dtype)
     for operation in APPLICATIONS.values():
-        error = Trial(Subject(dyn, [Inputs(scene, 256)]), operation, sample=2).check()
+        error = TrialRun(Subject(dyn, [Inputs(scene, 256)]), operation, sample=2).check()
         assert error <= (1e-4 if dtype == "float32" else 1e-10), operation.name
     q = states(scene, 256, dtype=dtype)["q"]
     dense = Dense(scene, q[7])

@@ -10,8 +10,7 @@ import pytest
 import torch
 import torch.multiprocessing as processes
 
-from warp_spo.env import learning, make
-from warp_spo.env import training_log as course
+from warp_spo.env import learning, make, training_log
 from warp_spo.env.tasks import task
 
 pytestmark = pytest.mark.slow
@@ -81,7 +80,7 @@ def test_two_processes_reach_the_return_of_one(tmp_path):
     own = {**os.environ, "PYTHONPATH": os.pathsep.join([str(pathlib.Path(__file__).parents[2]), *sys.path])}
     for folder, more in zip(folders, (["--gpus", "2", "--worlds", "64"], ["--worlds", "128"]), strict=True):
         subprocess.run([*command, *more, "--out", str(folder)], check=True, env=own, stdout=subprocess.DEVNULL)
-    two, one = (course.read_rows(folder / "progress.jsonl") for folder in folders)
+    two, one = (training_log.read_rows(folder / "progress.jsonl") for folder in folders)
     assert len(two) == len(one) == 100
     assert max(two[0]["reward"], one[0]["reward"]) < 1.0
     last = [sum(row["reward"] for row in rows[-10:]) / 10.0 for rows in (two, one)]

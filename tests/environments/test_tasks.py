@@ -11,8 +11,13 @@ pytest.importorskip("rsl_rl")
 import warp_spo as spo  # noqa: E402
 from warp_spo import env as envs  # noqa: E402
 from warp_spo import play, train  # noqa: E402
-from warp_spo.env import evaluation, learning, observations, robots  # noqa: E402
-from warp_spo.env import training_log as course  # noqa: E402
+from warp_spo.env import (  # noqa: E402
+    evaluation,
+    learning,
+    observations,
+    robots,
+    training_log,
+)
 from warp_spo.env.tasks import TASKS, go2_flat, go2_rough, task, velocity  # noqa: E402
 from warp_spo.viewing import Camera, Primitive, films  # noqa: E402
 from warp_spo.viewing.renderer import Renderer  # noqa: E402
@@ -76,7 +81,7 @@ def test_an_unknown_task_is_refused():
 
 
 def test_a_training_leaves_checkpoints_and_a_course(trained):
-    rows = course.read_rows(trained / "progress.jsonl")
+    rows = training_log.read_rows(trained / "progress.jsonl")
     assert [row["iteration"] for row in rows] == [0, 1, 2] and all(
         np.isfinite(list(row.values())).all() for row in rows
     )
@@ -95,7 +100,7 @@ def test_a_course_prints_no_numbers_of_episodes_that_have_not_ended(tmp_path, ca
         env = types.SimpleNamespace(
             device="cpu", log=lambda row=row: {n: torch.tensor(float(x)) for n, x in zip(names, row, strict=True)}
         )
-        one = course.Course(env, tmp_path, 1, 0.0, True)
+        one = training_log.TrainingLog(env, tmp_path, 1, 0.0, True)
         one.init_logging_writer()
         one.log(0, 1, 0.1, 0.1, {}, action_std=torch.ones(1), learning_rate=1e-3)
         assert words in capsys.readouterr().out
@@ -116,14 +121,14 @@ def test_a_training_resumes(trained, tmp_path):
 
 
 def test_a_resumed_training_drops_the_rows_after_its_checkpoint(trained, tmp_path):
-    """A course has each iteration once, and seconds that grow."""
+    """A log has each iteration once, and seconds that grow."""
     env, learner = envs.make("cartpole", 16, "cpu"), task("cartpole").LEARNER
     learning.train(env, learner, tmp_path, 3, seed=1)
     (tmp_path / "model_1.pt").write_bytes((trained / "model_2.pt").read_bytes())
     found = torch.load(tmp_path / "model_1.pt", weights_only=True) | {"iter": 1}
     torch.save(found, tmp_path / "model_1.pt")
     learning.train(env, learner, tmp_path, 5, resume=tmp_path / "model_1.pt")
-    rows = course.read_rows(tmp_path / "progress.jsonl")
+    rows = training_log.read_rows(tmp_path / "progress.jsonl")
     assert [row["iteration"] for row in rows] == [0, 1, 2, 3, 4]
     assert (np.diff([row["seconds"] for row in rows]) > 0.0).all()
     with pytest.raises(ValueError, match=r"holds a training; expected a new folder \(out\), or a checkpoint"):

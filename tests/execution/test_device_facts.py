@@ -11,8 +11,7 @@ from support import zoo
 from warp_spo.dynamics.inertia import SOLVE_MASS_MATRIX
 from warp_spo.execution import device_facts, plan
 from warp_spo.execution.device_facts import CPU, MEASURED, DeviceFacts
-from warp_spo.kernels import native
-from warp_spo.kernels import straight_line as straight
+from warp_spo.kernels import native, straight_line
 
 L4 = DeviceFacts("NVIDIA L4", multiprocessors=58, shared_bytes=100 * 1024)
 RTX_4090 = DeviceFacts("NVIDIA GeForce RTX 4090", multiprocessors=128, shared_bytes=100 * 1024)
@@ -22,16 +21,18 @@ def test_a_small_gpu_is_full_with_fewer_worlds():
     scene = zoo.fork()
     for device, limit in ((MEASURED, 32768), (L4, 14398), (RTX_4090, 31775)):
         few, many = (plan.choose(scene, limit + more, device, "float32") for more in (0, 1))
-        assert (few.granularity, many.granularity) == ("segment", "tree") and few.few and not many.few
+        assert (
+            (few.granularity, many.granularity) == ("segment", "tree") and few.latency_bound and not many.latency_bound
+        )
         assert f"up to {limit} worlds" in few.reason and f"more than {limit} worlds" in many.reason
     assert CPU.scaled(100) == 100
     few, many = (plan.choose(zoo.star(4), 17997 + more, L4, "float32") for more in (0, 1))  # limbs of one code
-    assert (few.granularity, many.granularity) == ("segment", "tree") and not few.few
+    assert (few.granularity, many.granularity) == ("segment", "tree") and not few.latency_bound
 
 
 def test_a_thread_of_a_scan_takes_more_nodes_on_a_small_gpu():
     scene = zoo.planar_chain(300)
-    large, small = (plan.choose(scene, 256, device, "float32").stretch for device in (MEASURED, L4))
+    large, small = (plan.choose(scene, 256, device, "float32").block_length for device in (MEASURED, L4))
     assert small == 2 * large > 0
 
 
@@ -83,7 +84,7 @@ def test_rows_that_a_block_may_not_declare_are_asked_for(bodies, asked, monkeypa
     dyn.operators(np.zeros((2, bodies))).phi.apply(x)
     [(more, text)] = kernels
     assert bool(more["shared"]) == asked == ("extern __shared__" in text)
-    assert not asked or straight.SHARED_BYTES < more["shared"] <= 2 * straight.SHARED_BYTES
+    assert not asked or straight_line.SHARED_BYTES < more["shared"] <= 2 * straight_line.SHARED_BYTES
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import warp_spo as spo
 from support import laws, warp_machine, zoo
 from support.granularity_scenes import DTYPES, GRANULARITIES, MANY, dynamics, equals_reference, states
 from warp_spo.execution import plan
-from warp_spo.kernels import straight_line as straight
+from warp_spo.kernels import straight_line
 
 
 @pytest.mark.parametrize("granularity", GRANULARITIES)
@@ -18,23 +18,23 @@ def test_a_long_result_that_shared_memory_cannot_hold(granularity, device, monke
     """Values that wait in the rows of the result, and parameters with them."""
     texts = warp_machine.recorded(monkeypatch)
     dyn = dynamics("two arms", granularity, MANY, "float64", device, varied=True)
-    monkeypatch.setattr(straight, "SHARED_BYTES", 5_000)  # twice as many in float64
+    monkeypatch.setattr(straight_line, "SHARED_BYTES", 5_000)  # twice as many in float64
     dyn.programs.builder.relays = True
     for operation in ("mass_matrix", "mass_matrix_inverse"):
         equals_reference(dyn, operation, states(dyn), laws.TOLERANCE["float64"])
-    assert {text.frame.result.way for text in texts} == {straight.RELAYED}
+    assert {text.frame.result.way for text in texts} == {straight_line.RELAYED}
 
 
-@pytest.mark.parametrize("way", [straight.MAPPED, straight.RELAYED])
+@pytest.mark.parametrize("way", [straight_line.MAPPED, straight_line.RELAYED])
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("granularity", GRANULARITIES)
 def test_long_results_that_begin_anywhere(granularity, dtype, way, device, monkeypatch):
     """Of worlds that fill no warp, no tile and no 16 bytes; nothing is written in front of the result or behind it."""
     operation = "mass_matrix" if granularity == "tree" else "mass_matrix_inverse"
     texts = warp_machine.recorded(monkeypatch)
-    if way == straight.RELAYED:  # room for a tile, and for what the limbs send, but not for all values
+    if way == straight_line.RELAYED:  # room for a tile, and for what the limbs send, but not for all values
         room = 1_250 if granularity == "tree" else 4_000
-        monkeypatch.setattr(straight, "SHARED_BYTES", room * 4)  # in float32
+        monkeypatch.setattr(straight_line, "SHARED_BYTES", room * 4)  # in float32
     for worlds in (1, 3, 33, 70):
         dyn = dynamics("two arms", granularity, worlds, dtype, device)
         dyn.programs.builder.relays = True

@@ -17,7 +17,7 @@ import warp_spo as spo
 from benchmarks.table import shapes
 from support.env_scenes import walker_q, walker_scene
 from warp_spo.env import make, robots
-from warp_spo.kernels import row_copies as rows
+from warp_spo.kernels import row_copies
 from warp_spo.runtime import launches, memory
 
 FEW = 1021  # worlds of the small batch: a prime, so that a world and its equals lie differently in their blocks
@@ -104,7 +104,7 @@ def test_copies_of_more_than_two_billion_entries(gpu, transposed):
     count, worlds = 16, (1 << 27) + 5
     source = torch.rand((worlds, count), device=gpu)
     target = torch.empty((count, worlds) if transposed else (worlds, count), device=gpu)
-    kernel, given = rows.copy(wp.float32, wp.float32, 1, transposed), [wp.from_torch(x) for x in (source, target)]
+    kernel, given = row_copies.copy(wp.float32, wp.float32, 1, transposed), [wp.from_torch(x) for x in (source, target)]
     launches.launch(kernel, worlds * count, [worlds, None, *given], [], device=gpu)
     found = target.T if transposed else target
     assert all(found[i : i + PART].equal(source[i : i + PART]) for i in range(0, worlds, PART))

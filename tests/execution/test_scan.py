@@ -12,12 +12,12 @@ from support import laws, zoo
 from support.allocations import no_warp_allocation
 from warp_spo.execution import plan
 from warp_spo.execution.device_facts import CPU, MEASURED
-from warp_spo.execution.node.path_blocks import cut, solid_nodes
+from warp_spo.execution.node.path_blocks import decompose, solid_nodes
 from warp_spo.runtime import launches
 
 SWEEP = {"float64": 1e-12, "float32": 5e-6}  # of P+, z+ and tau; float64 also of qdd
-SWEEPS = 4  # errors of float32 qdd, in those of float32 sweeps: with 4096 bodies 3.3 with a node a stretch, 2 with four
-PATHS = 10**6  # nodes of a stretch that is a whole path
+SWEEPS = 4  # errors of float32 qdd, in those of float32 sweeps: with 4096 bodies 3.3 with a node a block, 2 with four
+PATHS = 10**6  # nodes of a block that is a whole path
 SCANNED = ("forward_dynamics", "solve_mass_matrix", "mass_matrix_inverse", "log_det_mass_matrix", "inverse_dynamics")
 SCANNED += ("body_velocities", "jacobian", "operational_inertia_inverse")
 SCENES = ("rods", "chain_ball", "every_d6", "floating_tree", "trees25", "one_free", "star")
@@ -25,7 +25,7 @@ SCENES = ("rods", "chain_ball", "every_d6", "floating_tree", "trees25", "one_fre
 
 @pytest.fixture
 def scanned(device, monkeypatch):
-    """Make a Dynamics that scans, with so many nodes in a stretch."""
+    """Make a Dynamics that scans, with so many nodes in a block."""
 
     def make(scene, worlds, dtype="float64", length=1, **options):
         monkeypatch.setattr(plan, "STRETCH", length)
@@ -149,9 +149,9 @@ def forces(dyn, *state):
     found = np.full((dyn.scene.body_count, worlds, 6), np.nan)
     if run.scan is None:
         found[:] = z.numpy().transpose(0, 2, 1)
-    elif len(run.scan.cut.nodes) > 1:
+    elif len(run.scan.paths.nodes) > 1:
         leaving = run.scan._vector(1, 1).numpy().reshape(worlds, -1, 6)
-        found[[nodes[-1] for nodes in run.scan.cut.nodes]] = leaving.transpose(1, 0, 2)
+        found[[nodes[-1] for nodes in run.scan.paths.nodes]] = leaving.transpose(1, 0, 2)
     found[list(dyn.scene.tree.roots)] = np.nan
     return found
 
@@ -198,7 +198,7 @@ def test_launches_are_logarithmic(scanned, monkeypatch, device):
             patch.setattr(launches, "launch", lambda *a, launch=launch, to=launched, **k: to.append(launch(*a, **k)))
             dyn.forward_dynamics(q[None], tau[None], tau[None])
         counts.append(len(launched))
-        assert len(launched) <= dyn.recursions.scan.cut.launches + 2  # hinges, and forces of the bodies
+        assert len(launched) <= dyn.recursions.scan.paths.launches + 2  # hinges, and forces of the bodies
     assert counts[1] - counts[0] == 2 * 5  # a round more of motion, P, psi, z and alpha for each doubling
 
 
@@ -223,14 +223,14 @@ def test_massless_bodies_begin_no_stretch_that_receives(scanned, device):
     scene = wrists(6)
     solid = solid_nodes(scene)
     np.testing.assert_array_equal(solid, np.arange(scene.body_count) % 3 == 2)
-    pieces = cut(scene.tree, solid, 1)
-    assert all(solid[nodes[0]] for nodes, at in zip(pieces.nodes, pieces.position, strict=True) if at)
+    blocks = decompose(scene.tree, solid, 1)
+    assert all(solid[nodes[0]] for nodes, at in zip(blocks.nodes, blocks.position, strict=True) if at)
     q, qd, tau = zoo.random_state(scene, 2, 3)
     compare_with_sweeps(scene, 0.3 * q, qd, tau, scanned, (1, 4), device, dtypes=("float64",))
 
 
 def test_values_that_change_cut_the_tree_anew(scanned, device):
-    """A folded mass that becomes zero takes the body's right to begin a stretch."""
+    """A folded mass that becomes zero takes the body's right to begin a block."""
     scene = zoo.SCENES["rods"]()
     dyn = scanned(scene, 1)
     q, qd, tau = zoo.random_state(scene, 1, 0)
@@ -240,7 +240,7 @@ def test_values_that_change_cut_the_tree_anew(scanned, device):
         value[3] = 0.0
     with pytest.warns(UserWarning, match="is folded"):
         dyn.set(**light)
-    assert len(dyn.recursions.scan.cut.nodes) == 7
+    assert len(dyn.recursions.scan.paths.nodes) == 7
     wanted = spo.Dynamics(dyn.scene, 1, device, "float64", granularity="node").forward_dynamics(q, qd, tau)
     assert worst(dyn.forward_dynamics(q, qd, tau), wanted) <= SWEEP["float64"]
 
@@ -268,36 +268,39 @@ def test_stretches_of_random_trees(length):
         for k in range(1 + nodes // 50, nodes):
             parent[number[k]] = int(number[rng.integers(max(0, k - 4), k)])
         tree, solid = spo.Tree(parent), rng.random(nodes) < 0.7
-        pieces = cut(tree, solid, length)
-        assert sorted(node for stretch in pieces.nodes for node in stretch) == list(range(nodes))
-        assert len(pieces.levels) <= np.log2(nodes) + 1 or not solid.all()
-        level_of = [i for i, level in enumerate(pieces.levels) for _ in range(level.size)]
-        stretch_of = {node: s for s, stretch in enumerate(pieces.nodes) for node in stretch}
-        for s, stretch in enumerate(pieces.nodes):
-            assert all(parent[inner] == outer for inner, outer in itertools.pairwise(stretch))
-            assert all(len(tree.children[node]) == 1 for node in stretch[1:])
-            assert not pieces.position[s] or (solid[stretch[0]] and pieces.feed[s] == pieces.nodes[s - 1][-1])
-            assert len(stretch) <= length or not all(solid[node] for node in stretch[length:])
-            above = parent[stretch[-1]]
-            assert pieces.tree.parent[s] == (stretch_of[above] if above >= 0 else -1)
-            assert above < 0 or pieces.nodes[stretch_of[above]][0] == above
-            beside = set(tree.children[stretch[0]]) - {pieces.feed[s]}
-            assert all(level_of[stretch_of[child]] < level_of[s] for child in beside)
+        blocks = decompose(tree, solid, length)
+        assert sorted(node for path_block in blocks.nodes for node in path_block) == list(range(nodes))
+        assert len(blocks.levels) <= np.log2(nodes) + 1 or not solid.all()
+        level_of = [i for i, level in enumerate(blocks.levels) for _ in range(level.size)]
+        block_of = {node: s for s, path_block in enumerate(blocks.nodes) for node in path_block}
+        for s, path_block in enumerate(blocks.nodes):
+            assert all(parent[inner] == outer for inner, outer in itertools.pairwise(path_block))
+            assert all(len(tree.children[node]) == 1 for node in path_block[1:])
+            assert not blocks.position[s] or (solid[path_block[0]] and blocks.path_child[s] == blocks.nodes[s - 1][-1])
+            assert len(path_block) <= length or not all(solid[node] for node in path_block[length:])
+            above = parent[path_block[-1]]
+            assert blocks.tree.parent[s] == (block_of[above] if above >= 0 else -1)
+            assert above < 0 or blocks.nodes[block_of[above]][0] == above
+            beside = set(tree.children[path_block[0]]) - {blocks.path_child[s]}
+            assert all(level_of[block_of[child]] < level_of[s] for child in beside)
 
 
 # -- the plan ----------------------------------------------------------------------------------------------------------
 def test_the_plan_scans_deep_trees_in_few_worlds():
     deep, flat = chain(300)[0], zoo.star(300)
     choose = functools.partial(plan.choose, dtype="float32")
-    assert choose(deep, 1, MEASURED).stretch == plan.STRETCH and choose(deep, 16, MEASURED).stretch == plan.STRETCH
+    assert (
+        choose(deep, 1, MEASURED).block_length == plan.BLOCK_LENGTH
+        and choose(deep, 16, MEASURED).block_length == plan.BLOCK_LENGTH
+    )
     assert "launches in a row against 1200 of sweeps" in plan.describe_recursion(choose(deep, 1, MEASURED))
-    assert [choose(deep, worlds, MEASURED).stretch for worlds in (1024, 4096, 16384)] == [16, 64, 256]
+    assert [choose(deep, worlds, MEASURED).block_length for worlds in (1024, 4096, 16384)] == [16, 64, 256]
     for scene, worlds, options in ((flat, 1, {}), (deep, 65536, {}), (deep, 1, {"varies": True})):
-        assert not choose(scene, worlds, MEASURED, **options).stretch
-    assert not choose(deep, 1, MEASURED, granularity="node").stretch  # bits do not depend on the number of worlds
-    assert not choose(deep, 1, MEASURED, recursion="sweep").stretch
-    assert choose(deep, 1, CPU).stretch == 300 and not choose(deep, 64, CPU).stretch
-    assert choose(deep, 1, CPU, varies=True).stretch == 300  # a path in one stretch needs no element
+        assert not choose(scene, worlds, MEASURED, **options).block_length
+    assert not choose(deep, 1, MEASURED, granularity="node").block_length  # bits do not depend on the number of worlds
+    assert not choose(deep, 1, MEASURED, recursion="sweep").block_length
+    assert choose(deep, 1, CPU).block_length == 300 and not choose(deep, 64, CPU).block_length
+    assert choose(deep, 1, CPU, variable_inertia=True).block_length == 300  # a path in one block needs no element
     assert choose(zoo.SCENES["rods"](), 1, MEASURED).scan_reason == ""
 
 
@@ -323,7 +326,7 @@ def test_refined_scans(scanned, device):
     q, qd, tau = (np.float64(np.float32(x)) for x in zoo.random_state(scene, 2, 0))
     wanted = spo.Dynamics(scene, 2, device, "float64", granularity="node").forward_dynamics(q, qd, tau)
     dyn = scanned(scene, 2, "float32", refine=2)
-    assert dyn._refinement.wide.plan.stretch == 1
+    assert dyn._refinement.wide.plan.block_length == 1
     assert worst(dyn.forward_dynamics(q, qd, tau), wanted) <= 2e-7
 
 

@@ -9,9 +9,7 @@ import warp as wp
 
 import warp_spo as spo
 from support import laws, symbolic, zoo
-from warp_spo.kernels import native
-from warp_spo.kernels import shared_rows as staged_rows
-from warp_spo.kernels import straight_line as straight
+from warp_spo.kernels import native, shared_rows, straight_line
 from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.model.tracing import Trace
 from warp_spo.trace import fusion
@@ -25,15 +23,15 @@ TYPES = {"float32": wp.float32, "float64": wp.float64}
 def compiled(values, rows, dtype, device, fuses=False):
     """``values`` of inputs ("x", i) for rows [world, i], by a kernel."""
     T, count = TYPES[dtype], len(values)
-    out = staged_rows.Row("out", 2, count)
-    frame = straight.KernelLayout(
-        rows=[staged_rows.Row("x", 2, rows.shape[1])], staged=False, fields=[],
-        result=straight.Result(straight.DIRECT, out), messages=0, warps=1, block=32)  # fmt: skip
+    out = shared_rows.SharedRow("out", 2, count)
+    frame = straight_line.KernelLayout(
+        rows=[shared_rows.SharedRow("x", 2, rows.shape[1])], staged=False, fields=[],
+        result=straight_line.ResultLayout(straight_line.DIRECT, out), messages=0, warps=1, block=32)  # fmt: skip
     emitter = Emitter(dtype, lambda array, entry: f"{array}_row[{entry}]",
                       lambda array, entry, value: f"if (mine) result_row[{entry}] = {value};",
                       lambda array, index: index[0], fuses=fuses)  # fmt: skip
     text = render(emitter.region([Store("out", (i,), value) for i, value in enumerate(values)]), dtype)
-    kernel = native.kernel("trace", straight.assemble(frame, text, text, T), [("x", 2), ("out", 2)], T)
+    kernel = native.kernel("trace", straight_line.assemble(frame, text, text, T), [("x", 2), ("out", 2)], T)
     x = wp.array(rows, dtype=T, device=device)
     result = wp.full((len(rows), count), float("nan"), dtype=T, device=device)
     threads = -(-len(rows) // 32) * 32 if device.is_cuda else len(rows)
@@ -213,8 +211,8 @@ def test_sine_and_cosine(dtype, coordinate, device):
     "c, old, new", [("float", "(quadrant + 1) & 2", "quadrant & 2"), ("float", "-3.13916473e-7f", "-3.13916e-7f")]
 )
 def test_a_wrong_sine_is_seen(c, old, new, device, monkeypatch):
-    assert straight.NATIVE[c].count(old) == 1
-    monkeypatch.setitem(straight.NATIVE, c, straight.NATIVE[c].replace(old, new))
+    assert straight_line.NATIVE[c].count(old) == 1
+    monkeypatch.setitem(straight_line.NATIVE, c, straight_line.NATIVE[c].replace(old, new))
     with pytest.raises(AssertionError):
         test_sine_and_cosine("float32", True, device)
 
@@ -249,17 +247,17 @@ def test_reciprocal_and_root(dtype, device):
 
 
 def test_a_warp_waits_for_a_row_where_it_first_uses_it():
-    rows = [staged_rows.Row(name, 2, 18) for name in ("q", "qd", "tau")]
+    rows = [shared_rows.SharedRow(name, 2, 18) for name in ("q", "qd", "tau")]
     statements = ["a = 1;", "b = q_row[3];", "if (b) {", "if (a) {", "b = tau_row[0] + qd_row[1];", "}", "}", "c = 2;"]
-    found = staged_rows.wait_where_used("\n".join(statements), rows).split("\n")
+    found = shared_rows.wait_where_used("\n".join(statements), rows).split("\n")
     waits = {line: found[at + 1] for at, line in enumerate(found) if "wait_group" in line}
     numbers = {re.search(r"wait_group (\d)", line)[1]: after for line, after in waits.items()}
     assert numbers == {"2": "b = q_row[3];", "0": "if (b) {"}, "one wait for two rows, outside of the braces"
     assert [line for line in found if "wait_group" not in line] == statements
     assert all("__syncwarp();" in line for line in waits)
-    late = staged_rows.copy_rows_in(rows, {row.name: 0 for row in rows}, "float", 32, direct=True, late=True)
-    assert late.count(staged_rows.COMMIT) == 2 * len(rows) and staged_rows.WAIT_FOR_COPIES not in late
-    assert staged_rows.copy_rows_in(rows, {row.name: 0 for row in rows}, "float", 32, direct=True).count("wait") == 1
+    late = shared_rows.copy_rows_in(rows, {row.name: 0 for row in rows}, "float", 32, direct=True, late=True)
+    assert late.count(shared_rows.COMMIT) == 2 * len(rows) and shared_rows.WAIT_FOR_COPIES not in late
+    assert shared_rows.copy_rows_in(rows, {row.name: 0 for row in rows}, "float", 32, direct=True).count("wait") == 1
 
 
 def test_a_product_begins_with_the_other_summand_of_its_sum(device):
@@ -294,5 +292,5 @@ def test_a_product_begins_with_the_other_summand_of_its_sum(device):
 def test_pointers_into_rows_have_names_of_their_own():
     """Steps of other integrators read q beside q_from."""
     for row in ("q", "qd"):
-        copy = staged_rows._copy_in(staged_rows.Row(row, 2, 7), 0, "float", False)
+        copy = shared_rows._copy_in(shared_rows.SharedRow(row, 2, 7), 0, "float", False)
         assert not re.search(rf"\b{row}_(from|to)\b", copy.declared + copy.one + copy.several)

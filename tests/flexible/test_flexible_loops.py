@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import warp_spo as spo
-from warp_spo.dynamics.loop_analysis import Closing
+from warp_spo.dynamics.loop_analysis import ClosureEvaluator
 from warp_spo.examples.parts import at, bar
 
 DENSE = 1e-10  # the rows' change along qd is a difference of two Jacobians
@@ -55,7 +55,7 @@ def test_accelerations_solve_the_equation_with_multipliers(fourbar, closed, devi
     dyn, q, qd = closed
     tree = spo.Dynamics(fourbar, 2, device=device, dtype="float64", loops="cut")
     tau = np.random.default_rng(1).normal(size=qd.shape)
-    mass, bias, rows = tree.mass_matrix(q), tree.bias_force(q, qd), lambda q: Closing(fourbar).at(q)[1]
+    mass, bias, rows = tree.mass_matrix(q), tree.bias_force(q, qd), lambda q: ClosureEvaluator(fourbar).at(q)[1]
     Y, h = rows(q), 1e-6
     change = (rows(tree.integrate(q, qd, h)) - rows(tree.integrate(q, qd, -h))) / (2.0 * h)
     found = dyn.forward_dynamics(q, qd, tau)

@@ -11,7 +11,7 @@ from support import laws, symbolic, warp_machine, zoo
 from support.granularity_scenes import hand
 from support.routines import ROUTINES
 from warp_spo.execution import plan
-from warp_spo.kernels import straight_line as straight
+from warp_spo.kernels import straight_line
 from warp_spo.recursions.derivatives import power
 from warp_spo.recursions.derivatives.power import FromParent, Power
 from warp_spo.reference.dense import Dense
@@ -124,7 +124,7 @@ def test_warps_meet_at_barriers_alone(name, staged, monkeypatch):
     """The CUDA text of both kernels, warp by warp in either order, with rows and results in shared memory or not."""
     for limit in ("FEW_WORLDS", "LONG_ROWS") if staged else ():
         monkeypatch.setattr(plan, limit, 0)
-    monkeypatch.setattr(straight, "SHARED_BYTES", 1 << 20)
+    monkeypatch.setattr(straight_line, "SHARED_BYTES", 1 << 20)
     texts, scene = warp_machine.recorded(monkeypatch), WARPS[name]()
     dyn = spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity="segment")
     a, rate, wide = laws.states(scene, WORLDS), (WORLDS, scene.dof_count), (WORLDS, scene.coord_count)

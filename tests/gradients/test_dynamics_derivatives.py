@@ -10,11 +10,11 @@ import warp_spo as spo
 from benchmarks.table import cases
 from support import laws, oracles, symbolic, warp_machine, zoo
 from support.allocations import no_warp_allocation
-from support.pieces_of_trees import TREES
+from support.segments_of_trees import TREES
 from support.robots import ROBOTS
 from support.routines import ROUTINES
 from warp_spo.execution.plan import MOST_DOFS
-from warp_spo.kernels import straight_line as straight
+from warp_spo.kernels import straight_line
 from warp_spo.recursions.derivatives import inverse_dynamics as dense
 from warp_spo.recursions.derivatives import sensitivity
 from warp_spo.reference.dense import Dense
@@ -113,7 +113,7 @@ def test_mass_matrix_derivative_by_central_differences(name):
 @pytest.mark.parametrize("name", ["fork", "comb", "forest"])
 def test_limbs_side_by_side(name, given, monkeypatch):
     """The CUDA text, warp by warp in either order, gives what one thread gives for the whole tree."""
-    monkeypatch.setattr(straight, "SHARED_BYTES", 1 << 20)
+    monkeypatch.setattr(straight_line, "SHARED_BYTES", 1 << 20)
     scene, texts = TREES[name]() if name in TREES else scene_of(name), warp_machine.recorded(monkeypatch)
     n, a = scene.dof_count, laws.states(scene, 3)
     dyn = spo.Dynamics(scene, 3, device="cpu", dtype="float64", granularity="segment")
@@ -341,7 +341,7 @@ BUGS = {
     "the whirl": (sensitivity, "of_coordinates", "skew(w) + (", "skew(w) - ("),
     "the joint's own slide": (sensitivity, "of_coordinates", " + cross(change, slide)", ""),
     "the parent's spin in a rate": (sensitivity, "of_rates", "spin_c + motion.spin", "motion.spin"),
-    "drift of the origins": (sensitivity.Row, "to_parent", " + cross(drift, v) * 2.0", ""),
+    "drift of the origins": (sensitivity.SensitivityAdjoint, "to_parent", " + cross(drift, v) * 2.0", ""),
     "moments of a load": (sensitivity, "to_parent", " + _lever(l, pull)", ""),
     "a row's pull": (sensitivity.CarriedSums, "row", " + cross(self.pull, v)", ""),
     "the force elsewhere": (dense, "_entries", " + cross(s.shift, force[1])", ""),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_spo.execution import mass_inverse_products as products
+from warp_spo.execution import mass_inverse_products
 from warp_spo.kernels import products as kernels
 from warp_spo.kernels.straight_line import SHARED_BYTES, TILE
 
@@ -42,7 +42,7 @@ def test_products(size, limbs, worlds, chunks, dtype, device):
     tiles = np.full((-(-worlds // TILE), count, TILE), np.nan, dtype)  # NaN where there is no world
     for world in range(worlds):
         tiles[world // TILE, slots[mask], world % TILE] = B[world][mask]
-    product = products.build(size, places, count, T, wp.get_device(device))
+    product = mass_inverse_products.build(size, places, count, T, wp.get_device(device))
     out = [wp.full(A.shape, float("nan"), dtype=T, device=device) for _ in range(2)]
     product.launch(wp.array(A, dtype=T, device=device), wp.array(tiles, dtype=T, device=device), *out)
     for block, got in enumerate(out):

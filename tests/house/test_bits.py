@@ -17,8 +17,8 @@ from support.granularity_scenes import GRANULARITIES, dynamics, states
 from warp_spo.errors import UnsupportedError
 from warp_spo.execution import plan
 from warp_spo.execution.device_facts import MEASURED
-from warp_spo.trials.inputs import APPLICATIONS, DT, OPERATIONS, Inputs, Operation
-from warp_spo.trials.trial import Subject, Trial
+from warp_spo.trials.inputs import APPLICATIONS, DT, OPERATIONS, Inputs, TrialCase
+from warp_spo.trials.trial import Subject, TrialRun
 
 STATES = 31  # different worlds; one less than a warp has threads, so that each comes to stand in every place of a warp
 COUNTS = (1, 2, 33, 1000, 4096, 65536)
@@ -33,7 +33,7 @@ SCENES = {
 
 def stepping(name, substeps):
     """A step, of which the rates count."""
-    return Operation(
+    return TrialCase(
         name,
         ("q", "qd", "tau"),
         lambda scene: (scene.dof_count,),
@@ -73,7 +73,7 @@ def evaluated(scene, worlds, granularity, dtype, operation, device):
     """The words of a result [world, word], and the granularity that the operation has."""
     dyn = spo.Dynamics(scene, worlds, device=device, dtype=dtype, granularity=granularity)
     subject = Subject(dyn, [Mixed(scene, worlds)])
-    trial = Trial(subject, operation)
+    trial = TrialRun(subject, operation)
     if operation.reveal:
         operation.reveal(subject, *trial._inputs[0], out=trial.out)
     assert not np.isnan(trial.out[:1].numpy()).any()
@@ -177,6 +177,6 @@ def test_formulas_do_not_depend_on_the_number_of_worlds(granularity, dtype):
     for links in (7, 40):
         scene = shapes.random_tree(links)
         plans = [plan.choose(scene, worlds, MEASURED, dtype, granularity) for worlds in (1, 1000, 65536, 1 << 20)]
-        assert len({one.apart for one in plans}) == 1
-        found.add(plans[0].apart)
+        assert len({one.bias_first for one in plans}) == 1
+        found.add(plans[0].bias_first)
     assert True in found

@@ -9,17 +9,13 @@ from support.laws import TOLERANCE
 from support.mutants import mutant
 from support.routines import ROUTINES
 from warp_spo.execution.node import functions as node_functions
-from warp_spo.execution.node import sweeps as levels
-from warp_spo.execution.segment import shared_code as shared_text
-from warp_spo.execution.segment import warp_specialized as teams
+from warp_spo.execution.node import sweeps
+from warp_spo.execution.segment import shared_code, warp_specialized
 from warp_spo.graph import blocks
-from warp_spo.kernels import straight_line as straight
-from warp_spo.recursions import articulated, articulated_sweeps, newton_euler
-from warp_spo.recursions import mass_matrix_inverse as inverse
-from warp_spo.recursions.model import links, messages
-from warp_spo.recursions.model import segments as pieces
-from warp_spo.trace import scalars as graph
-from warp_spo.trace import spatial
+from warp_spo.kernels import straight_line
+from warp_spo.recursions import articulated, articulated_sweeps, mass_matrix_inverse, newton_euler
+from warp_spo.recursions.model import links, messages, segments
+from warp_spo.trace import scalars, spatial
 
 WORLDS = 3
 
@@ -59,7 +55,7 @@ def test_an_unwritten_output(plant, device):
     dyn, arrays = dynamics(device)
     laws.every_entry_is_written(dyn, "inverse_dynamics", arrays)
     plant(
-        levels,
+        sweeps,
         "newton_euler",
         "            tau_out[world, dof] = tau",
         "            if dof > 0:\n                tau_out[world, dof] = tau",
@@ -73,7 +69,7 @@ def test_worlds_that_leak_into_each_other(plant, device):
     dyn, arrays = dynamics(device)
     laws.worlds_do_not_touch_each_other(dyn, "inverse_dynamics", arrays)
     plant(
-        levels,
+        sweeps,
         "kinematics",
         "alpha = s.load_motion(acceleration_out, parent, world)",
         "alpha = s.load_motion(acceleration_out, parent, wp.max(world - 1, 0))",
@@ -88,7 +84,7 @@ def test_a_wrong_gyroscopic_sign(monkeypatch, device):
     dyn, arrays = dynamics(device, "screw_tree")
     laws.bias_force_is_christoffel(dyn, arrays, 1e-6)
     symbolic.plant(monkeypatch, newton_euler, "body_force", "+ cross(motion.spin", "- cross(motion.spin")
-    monkeypatch.setattr(levels, "node_functions", node_functions.NodeFunctions)
+    monkeypatch.setattr(sweeps, "node_functions", node_functions.NodeFunctions)
     dyn, arrays = dynamics(device, "screw_tree")
     laws.forward_undoes_inverse_dynamics(dyn, arrays, TOLERANCE["float64"])  # blind, as theory says
     with pytest.raises(AssertionError):
@@ -106,7 +102,7 @@ def test_a_missing_child(plant, file, operation, device):
     dyn, arrays = dynamics(device)
     laws.equals_reference(dyn, operation, arrays, TOLERANCE["float64"])
     old = "for c in range(topology.child_start[node], topology.child_start[node + 1]):"
-    plant(levels, file, old, old.replace("topology.child_start[node + 1]", "topology.child_start[node + 1] - 1"))
+    plant(sweeps, file, old, old.replace("topology.child_start[node + 1]", "topology.child_start[node + 1] - 1"))
     dyn, arrays = dynamics(device)
     with pytest.raises(AssertionError):
         laws.equals_reference(dyn, operation, arrays, TOLERANCE["float64"])
@@ -149,7 +145,7 @@ MUTANTS = {
     "mirror of a symmetric matrix": (links, "symmetric", "[xz, yz, zz]", "[yz, xz, zz]", "inverse_dynamics", ("qd",)),
     "turn the wrong way": (spatial.Pose, "to_child", "c * v[1] - s * v[0]", "c * v[1] + s * v[0]",
                            "inverse_dynamics", ("qdd",)),
-    "a sign lost in folding": (graph, "multiply", "!= (y.op", "and (y.op", "inverse_dynamics", ("qd", "qdd")),
+    "a sign lost in folding": (scalars, "multiply", "!= (y.op", "and (y.op", "inverse_dynamics", ("qd", "qdd")),
     "a pivot out of order": (articulated, "reduce_link", "given[::-1]", "given", "forward_dynamics", ("tau",)),
 }  # fmt: skip
 
@@ -166,7 +162,7 @@ def test_a_wrong_step(bug, monkeypatch):
 def team_error(monkeypatch, operation="forward_dynamics", name="star"):
     """Of the CUDA text of a scene's warps, against the dense reference; raises Race."""
     texts = warp_machine.recorded(monkeypatch)
-    monkeypatch.setattr(straight, "SHARED_BYTES", 1 << 20)
+    monkeypatch.setattr(straight_line, "SHARED_BYTES", 1 << 20)
     scene = zoo.SCENES[name]()
     dyn = spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity="segment")
     arrays = laws.states(scene, WORLDS)
@@ -179,13 +175,14 @@ def team_error(monkeypatch, operation="forward_dynamics", name="star"):
 
 
 TEAM_MUTANTS = {
-    "a slot too near": (messages, "slots", "at += size(letter, piece)", "at += size(letter, piece) - 1"),
-    "no barrier before the trunk": (pieces.Pieces, "_hand_over",
-                                    "child.inward + (child.warp != piece.warp)", "child.inward"),
-    "no barrier after the trunk": (pieces.Pieces, "__init__",
-                                   "piece.parent.outward + (piece.warp != piece.parent.warp)", "piece.parent.outward"),
-    "another limb's entries": (shared_text.SharedText, "_distances", "who * {step}", "who * {step + 1}"),
-    "another limb's constants": (shared_text.SharedText, "merge", "zip(*constants.columns, strict=True)",
+    "a slot too near": (messages, "offsets", "at += size(letter, segment)", "at += size(letter, segment) - 1"),
+    "no barrier before the trunk": (segments.Segments, "_hand_over",
+                                    "child.inward + (child.warp != segment.warp)", "child.inward"),
+    "no barrier after the trunk": (segments.Segments, "__init__",
+                                   "segment.parent.outward + (segment.warp != segment.parent.warp)",
+                                   "segment.parent.outward"),
+    "another limb's entries": (shared_code.SharedCode, "_distances", "who * {step}", "who * {step + 1}"),
+    "another limb's constants": (shared_code.SharedCode, "merge", "zip(*constants.columns, strict=True)",
                                  "[*zip(*constants.columns, strict=True)][::-1]"),
 }  # fmt: skip
 
@@ -206,13 +203,28 @@ def test_a_wrong_team(bug, monkeypatch):
 
 
 INVERSE_MUTANTS = {
-    "another column": (inverse.Inverse, "_meet", "sent[length * at : length * at + common]", "sent[:common]"),
-    "what lies further in": (inverse.Inverse, "_come_back", "[dot(row, force) for row in N]", "[0.0 for row in N]"),
-    "parted too early": (pieces.Piece, "fork", "(other, *other.ancestors)", "reversed((other, *other.ancestors))"),
-    "no barrier before they meet": (teams.Team, "cuda", "BARRIER, self._rounds(alike)", "self._rounds(alike)"),
-    "another limb's turns": (shared_text.SharedText, "take_turns", "initial=0", "initial=1"),
+    "another column": (
+        mass_matrix_inverse.Inverse,
+        "_meet",
+        "sent[length * at : length * at + common]",
+        "sent[:common]",
+    ),
+    "what lies further in": (
+        mass_matrix_inverse.Inverse,
+        "_come_back",
+        "[dot(row, force) for row in N]",
+        "[0.0 for row in N]",
+    ),
+    "parted too early": (
+        segments.Segment,
+        "common_ancestor",
+        "(other, *other.ancestors)",
+        "reversed((other, *other.ancestors))",
+    ),
+    "no barrier before they meet": (warp_specialized.WarpSpecializedKernel, "cuda", "BARRIER,\n", ""),
+    "another limb's turns": (shared_code.SharedCode, "take_turns", "initial=0", "initial=1"),
     "a turn too few": (
-        shared_text.SharedText,
+        shared_code.SharedCode,
         "take_turns",
         "counts.values())}; ++each",
         "[n - 1 for n in counts.values()])}; ++each",
@@ -223,7 +235,7 @@ INVERSE_MUTANTS = {
 @pytest.mark.parametrize("bug", INVERSE_MUTANTS)
 def test_a_wrong_inverse(bug, monkeypatch):
     """Branches that meet where limbs part, and part again, in loops."""
-    monkeypatch.setattr(shared_text, "CACHED", 0)
+    monkeypatch.setattr(shared_code, "CACHED", 0)
     assert team_error(monkeypatch, "mass_matrix_inverse", "dancer") <= TOLERANCE["float64"]
     symbolic.plant(monkeypatch, *INVERSE_MUTANTS[bug])
     try:

@@ -69,7 +69,7 @@ def test_a_rolling_knee_has_the_columns_of_its_closed_form():
     """omega = z, v = R* (-r, 0, 0); its velocity is constant in the parent, so that R* p'' = 0 and v' = -omega x v."""
     scene, *_ = rolling()
     link = Links(scene).links[0]
-    place = link.hinge.placed(link, lambda i: link_input(link, i))
+    place = link.hinge.transform(link, lambda i: link_input(link, i))
     ((w, v),) = link.hinge.columns(place)
     rates = [link_input(link, 1)]
     bias = link.hinge.own_bias(place, rates)

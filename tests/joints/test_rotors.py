@@ -19,8 +19,8 @@ from support.step_scenes import states as step_states
 from warp_spo.dynamics.loop_analysis import embedding
 from warp_spo.examples import fourbar
 from warp_spo.reference.dense import Dense
-from warp_spo.trials.inputs import DECLARED, Inputs, of_declaration
-from warp_spo.trials.trial import Subject, Trial
+from warp_spo.trials.inputs import DECLARED, Inputs, trial_case
+from warp_spo.trials.trial import Subject, TrialRun
 
 EXACT = 1e-12  # float64, two bodies
 SPIN = 1e-4  # of the rotors [kg m^2]
@@ -294,7 +294,7 @@ def test_every_declared_operation_equals_the_reference_or_is_refused_by_name(mod
     subject, refused = Subject(spo.Dynamics(scene, WORLDS, device, "float64"), [Inputs(scene, WORLDS)]), []
     for declared in (d for d in DECLARED.values() if d.trial is not None):
         try:
-            assert Trial(subject, of_declaration(declared)).check() <= 1e-11, declared.name
+            assert TrialRun(subject, trial_case(declared)).check() <= 1e-11, declared.name
         except spo.UnsupportedError as error:
             assert "rotors" in str(error)
             refused.append(declared.name)

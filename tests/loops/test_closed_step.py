@@ -10,12 +10,11 @@ from support import implicit, laws, mechanisms, symbolic
 from support.mechanisms import MECHANISMS
 from support.rollouts import energy
 from support.step_scenes import FORCES, furnished, smooth
-from warp_spo.dynamics.loop_analysis import Closing
+from warp_spo.dynamics.loop_analysis import ClosureEvaluator
 from warp_spo.errors import UnsupportedError
 from warp_spo.examples.parts import at, bar
 from warp_spo.recursions.loops import closed_step, clusters
-from warp_spo.recursions.step import joint_laws as impedance
-from warp_spo.recursions.step import step
+from warp_spo.recursions.step import joint_laws, step
 
 H = 2e-3
 SHORTEST = 1e-7  # of the way back onto the closures: ours is the shortest seen from where the step ends, O(h^4)
@@ -105,7 +104,7 @@ def released(dtype, device, worlds=3, **values):
     scene = MECHANISMS["fourbar"]().with_values(**values)
     dyn = spo.Dynamics(scene, worlds, device=device, dtype=dtype, loops="embed")
     crank = np.linspace(0.0, 3.0, worlds)
-    q = Closing(scene).closed(np.stack([crank, -1.0 - crank, np.full(worlds, 2.0)], axis=1))
+    q = ClosureEvaluator(scene).closed(np.stack([crank, -1.0 - crank, np.full(worlds, 2.0)], axis=1))
     return dyn, [wp.array(x, dtype=dyn.dtype, device=device) for x in (q, np.zeros_like(q))]
 
 
@@ -132,7 +131,7 @@ def test_closure_is_rounding(dtype, device):
         for _ in range(10):
             dyn.step(q, qd, None, 1e-3, out=(q, qd))
         worst = max(worst, np.abs(dyn.closure_error(q).numpy()).max())
-    closing = Closing(dyn.scene)
+    closing = ClosureEvaluator(dyn.scene)
     Y = closing.at(q.numpy().astype(np.float64))[1]
     assert worst <= ROUNDING[dtype]
     assert np.abs(np.einsum("wri,wi->wr", Y, qd.numpy())).max() <= 10.0 * ROUNDING[dtype]
@@ -167,7 +166,7 @@ def test_a_limit_on_a_dependent_dof_holds(device):
 WAYS = [
     (clusters, "expand_cluster", "k.get(dof, 0.0) + ", "", "energy"),
     (closed_step.ClosedStep, "_close", "qd[dof] + change", "qd[dof] + 1.001 * change", "closure"),
-    (impedance.Impedance, "_limits", "depth = inward *", "depth = -1.0 * inward *", "limit"),
+    (joint_laws.JointLaws, "_limits", "depth = inward *", "depth = -1.0 * inward *", "limit"),
 ]
 
 
@@ -235,7 +234,7 @@ def test_what_stays_open_has_a_word(loops, dtype, device):
     """Bars at 10 rad/s: steps of up to 20 ms close, steps of 0.1 s do not; nor does an open state, at once. The word is
     there exactly where closures, as shares of the bars' lengths, are open by more than what it names."""
     scene = MECHANISMS["fourbar"]()
-    closing = Closing(scene)
+    closing = ClosureEvaluator(scene)
     q, qd = crank_turning(closing)
     worlds = len(q)
     dyn = spo.Dynamics(scene, worlds, device=device, dtype=dtype, loops=loops)
@@ -278,7 +277,7 @@ def test_a_truss_is_closed(loops, dtype, device):
 def test_the_word_sees_each_coordinate_and_rate(device):
     """A bug of either way back alone: the position's, the rates'."""
     scene = MECHANISMS["fourbar"]()
-    closing = Closing(scene)
+    closing = ClosureEvaluator(scene)
     q, qd = crank_turning(closing, 3)
     for of in ("rate for rate", "g for g"):
         with pytest.MonkeyPatch.context() as patch:

@@ -8,7 +8,7 @@ import warp_spo as spo
 from support import laws, mechanisms, symbolic, zoo
 from support.closed_loops import AGREE, DIFFERENCES, LOADED, both, by_embedding
 from support.mechanisms import MECHANISMS, Closed
-from warp_spo.dynamics.loop_analysis import Closing
+from warp_spo.dynamics.loop_analysis import ClosureEvaluator
 from warp_spo.examples.parts import at
 
 
@@ -53,7 +53,7 @@ def test_multipliers_are_forces_of_the_loops(device):
     s = mechanisms.states(scene)
     lag, cut = (spo.Dynamics(scene, 3, device=device, dtype="float64", loops=loops) for loops in ("multipliers", "cut"))
     found, rank = lag.loop_multipliers(s.q, s.qd, s.tau, s.body_f)
-    Y = Closing(scene).at(s.q)[1]
+    Y = ClosureEvaluator(scene).at(s.q)[1]
     wanted = lag.forward_dynamics(s.q, s.qd, s.tau, s.body_f)
     moved = cut.forward_dynamics(s.q, s.qd, s.tau + np.einsum("wri,wr->wi", Y, found), s.body_f)
     np.testing.assert_allclose(moved, wanted, atol=1e-10 * np.abs(cut.forward_dynamics(s.q, s.qd, s.tau)).max())

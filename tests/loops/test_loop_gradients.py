@@ -9,7 +9,7 @@ import warp_spo as spo
 from support import mechanisms, symbolic
 from support.mechanisms import FIRST, MECHANISMS
 from support.step_scenes import furnished, held, smooth
-from warp_spo.dynamics.loop_analysis import Closing
+from warp_spo.dynamics.loop_analysis import ClosureEvaluator
 from warp_spo.errors import UnsupportedError
 from warp_spo.recursions.derivatives import adjoints, power
 from warp_spo.recursions.loops import embedded_adjoints
@@ -138,7 +138,7 @@ def test_both_ways_agree(name):
 def test_lagrange_along_what_closures_allow():
     """A curve of consistent states: the reference's accelerations change along it as J x says."""
     scene, how, s, _ = mechanisms.case("fourbar")
-    closing, h = Closing(scene), 1e-3
+    closing, h = ClosureEvaluator(scene), 1e-3
     v = s.qd
 
     def states(t):
@@ -233,8 +233,8 @@ def test_a_step_is_the_difference(name, device):
 STEP_BUGS = [
     (
         embedded_adjoints.ClosedEquations,
-        "put_back",
-        "ClosedStep(self.trace, self.loops.embedding).put_back(stores)",
+        "project_state",
+        "ClosedStep(self.trace, self.loops.embedding).project_state(stores)",
         "stores",
     ),
     (adjoints, "step_vjp", "- stiff[dof] * solved[dof]", ""),
@@ -304,7 +304,7 @@ def test_float32_and_what_is_written(device):
 def test_a_singular_world_is_nan_alone(device):
     """A flat parallelogram, where it may fold: its closures lose a row; and a world with a NaN."""
     scene = MECHANISMS["parallelogram"]()
-    s = mechanisms.states(scene, 1, q=Closing(scene).closed(np.array([[0.5, -0.5, 0.5]])))
+    s = mechanisms.states(scene, 1, q=ClosureEvaluator(scene).closed(np.array([[0.5, -0.5, 0.5]])))
     q = np.concatenate([s.q, np.zeros((1, 3)), s.q])
     qd, tau, y = (np.repeat(x, 3, 0) for x in (s.qd, s.tau, s.qdd))
     tau[2] = np.nan

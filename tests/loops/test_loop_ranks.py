@@ -7,7 +7,7 @@ import warp_spo as spo
 from support import laws, mechanisms, zoo
 from support.closed_loops import AGREE, DIFFERENCES, both, by_embedding, by_multipliers, flat, lagrange, traced
 from support.mechanisms import MECHANISMS, Closed
-from warp_spo.dynamics.loop_analysis import Closing, _spanning, drawn, embedding
+from warp_spo.dynamics.loop_analysis import ClosureEvaluator, _spanning, drawn, embedding
 from warp_spo.examples.parts import at, bar
 from warp_spo.recursions.loops.embedded import Embedding
 from warp_spo.reference.dense import homogeneous, pose7
@@ -40,7 +40,7 @@ def test_dead_points_pass():
     """A rocker as the independent dof: forward dynamics passes its dead point, minimal coordinates are lost there."""
     scene = MECHANISMS["fourbar"]()
     how = embedding(scene, asked=[2])  # relative angle between coupler and rocker
-    closing = Closing(scene)
+    closing = ClosureEvaluator(scene)
     crank = np.linspace(0.0, 2.0 * np.pi, 1000)
     start = np.stack([crank, -1.0 - crank, np.full(1000, 2.0)], axis=1)
     q = closing.closed(start)
@@ -114,7 +114,7 @@ def test_near_parallel_loops(apart, dtype):
         for x in (0.3, 0.3 + apart)
     ]
     scene = spo.Scene(scene.bodies, scene.hinges, loops=loops)
-    how = Embedding(tuple(_spanning(Closing(scene).at(q)[1])[0]), ())  # five of six
+    how = Embedding(tuple(_spanning(ClosureEvaluator(scene).at(q)[1])[0]), ())  # five of six
     s = mechanisms.States(q, *np.random.default_rng(0).normal(size=(3, 1, scene.dof_count)), np.zeros((1, 4, 6)))
     shapes = {"out": (scene.dof_count,), "margin": (len(how.rows),)}
     right = traced(scene, "embedded_forward_dynamics", s._asdict(), ("q", "tau"), shapes, embedding=how, status=True)
@@ -137,7 +137,7 @@ def test_redundant_loop_s25():
     """A planar loop welded in six directions: three rows count, and what they give is the hinge's answer."""
     scene = MECHANISMS["tilted, a weld"]()
     how, s = embedding(scene), mechanisms.states(scene)
-    assert Closing(scene).size == 6 and len(how.rows) == 3 and len(how.dofs) == 1
+    assert ClosureEvaluator(scene).size == 6 and len(how.rows) == 3 and len(how.dofs) == 1
     hinged, balled = MECHANISMS["tilted"](), MECHANISMS["tilted, a ball"]()
     assert len(embedding(hinged).rows) == len(embedding(balled).rows) == 2
     s = mechanisms.states(hinged)
@@ -152,7 +152,7 @@ def test_a_locked_loop_stands_still():
     scene = spo.Scene([bar(0.5), bar(0.4)], hinges, loops=[loop])
     how = embedding(scene)
     assert how.dofs == () and len(how.rows) == 2
-    q = Closing(scene).closed(drawn(scene, 64))[:2]
+    q = ClosureEvaluator(scene).closed(drawn(scene, 64))[:2]
     s = mechanisms.States(q, *np.zeros((1, 2, 2)), *np.ones((2, 2, 2)), np.ones((2, 2, 6)))
     assert np.abs(by_embedding(scene, how, s)).max() == 0.0
     assert np.abs(by_multipliers(scene, s)).max() <= 1e-12

@@ -16,7 +16,7 @@ from support.closed_loops import (
     traced,
 )
 from support.mechanisms import MECHANISMS, Closed
-from warp_spo.dynamics.loop_analysis import Closing, embedding
+from warp_spo.dynamics.loop_analysis import ClosureEvaluator, embedding
 from warp_spo.recursions.loops import closures, clusters, embedded, nullspace
 from warp_spo.recursions.loops.projection import place_links
 from warp_spo.recursions.model.links import Links
@@ -90,7 +90,7 @@ def test_random_trees_of_random_numbering(n, seed, kinds, couplings):
 def test_jacobian_and_bias_are_derivatives_of_the_error(name):
     """Rows of ours and of the reference forbid the same velocities, and ask for the same accelerations."""
     scene, _, s, references = mechanisms.case(name)
-    closing = Closing(scene)
+    closing = ClosureEvaluator(scene)
     error, Y = closing.at(s.q)
     for w, closed in enumerate(references):
         N = closed.null_space(closed.jacobian)

@@ -34,9 +34,9 @@ def test_a_scene_without_loops_is_the_open_tree():
     """All joints and contacts stay, and nothing is left to close."""
     scene = stool()
     bare = scene.without_loops()
-    assert not bare.ties and scene.ties and bare.values is scene.values
+    assert not bare.constraint_summary and scene.constraint_summary and bare.values is scene.values
     assert bare.contact_count == scene.contact_count and bare.joint_labels == scene.joint_labels
     assert not spo.Dynamics(bare, 1, "cpu").closed
     pin = spo.Loop("revolute", -1, 1, axis=(0, 1, 0))
     looped = spo.Scene(scene.bodies, scene.hinges, loops=[pin])
-    assert looped.ties and not looped.without_loops().loops
+    assert looped.constraint_summary and not looped.without_loops().loops

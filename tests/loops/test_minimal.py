@@ -10,7 +10,7 @@ from support.allocations import no_warp_allocation
 from support.closed_loops import traced
 from support.mechanisms import MECHANISMS, Closed
 from warp_spo.dynamics import inertia
-from warp_spo.dynamics.loop_analysis import Closing, embedding
+from warp_spo.dynamics.loop_analysis import ClosureEvaluator, embedding
 from warp_spo.recursions.loops import minimal
 
 DIFFERENCES = 1e-9  # what differences of order 8 leave of second derivatives; conditioning of the draws
@@ -118,7 +118,7 @@ def test_a_tight_loop_holds_the_frames_it_ties():
 def test_dead_points_pass():
     """A rocker as the independent dof, next to where it loses its hold on the crank: what needs no X has no trouble."""
     scene = MECHANISMS["fourbar"]()
-    how, closing = embedding(scene, asked=[2]), Closing(scene)  # relative angle between coupler and rocker
+    how, closing = embedding(scene, asked=[2]), ClosureEvaluator(scene)  # relative angle between coupler and rocker
     crank = np.linspace(0.0, 2.0 * np.pi, 1000)
     q = closing.closed(np.stack([crank, -1.0 - crank, np.full(1000, 2.0)], axis=1))
     X = np.linalg.svd(closing.at(q)[1][:, how.rows])[2][:, 2]

@@ -9,7 +9,7 @@ from support.solver_grounds import CFG, SIDE, WEIGHT, block, boxes, plane, run, 
 from support.solver_models import H
 from warp_spo import Status
 from warp_spo.errors import UnsupportedError
-from warp_spo.kernels import newton_contact_slots as contact_slots
+from warp_spo.kernels import newton_contact_slots
 from warp_spo.newton import SolverSPO
 from warp_spo.scene import contacts as scene_contacts
 
@@ -101,7 +101,7 @@ def test_slots_hold_the_first_contacts_of_their_shape(made):
     solver.step(start(model), model.state(), None, listed([(i, PLANE, i % 2 == 0, (0, 0, -1.0)) for i in owners]), H)
     slots = solver._slots._slot.numpy().reshape(4, 4)
     wanted = [[i for i, owner in enumerate(owners) if owner == shape][:4] for shape in range(4)]
-    assert [row[row != int(contact_slots.EMPTY)].tolist() for row in slots] == wanted
+    assert [row[row != int(newton_contact_slots.EMPTY)].tolist() for row in slots] == wanted
     solver.reset(model.state())
 
 
@@ -166,7 +166,7 @@ def test_a_slider_does_not_turn():
 
 
 def test_models_that_have_no_slots():
-    assert float(contact_slots.AWAY) == scene_contacts.AWAY
+    assert float(newton_contact_slots.AWAY) == scene_contacts.AWAY
     with pytest.raises(UnsupportedError, match="contacts of a model without shapes that stand still"):
         SolverSPO(boxes(None), contacts="pipeline")
     with pytest.raises(UnsupportedError, match="contacts='pipeline' with integrator='rk4'"):

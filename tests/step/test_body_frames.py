@@ -62,7 +62,7 @@ def test_equal_those_of_statements(name, variable, device):
 
 
 def test_warps_take_several_walks(monkeypatch, device):
-    """Where there are more pieces than warps."""
+    """Where there are more segments than warps."""
     monkeypatch.setattr(body_kinematics, "MOST_WARPS", 2)
     test_equal_those_of_statements("walker", (), device)
 

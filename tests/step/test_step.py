@@ -13,8 +13,7 @@ from support.step_scenes import FORCES, SETTLED, TOLERANCE, H, furnished, slider
 from warp_spo.errors import UnsupportedError
 from warp_spo.hinges import ball, free
 from warp_spo.kernels import pass_loops
-from warp_spo.recursions.step import joint_laws as impedance
-from warp_spo.recursions.step import joint_space, step
+from warp_spo.recursions.step import joint_laws, joint_space, step
 
 
 @pytest.mark.parametrize(
@@ -43,21 +42,21 @@ def test_equals_the_dense_nonlinear_equation(name, dtype, device):
 
 
 BUGS = [
-    (impedance.Impedance, "_spring", "+ self.ahead(link.dofs[i])", ""),
-    (impedance.Impedance, "_limits", "(0.0, None) if inward > 0.0 else (None, 0.0)", "None, None"),
-    (impedance.Law, "piece", "select(over, 0.0, resistance)", "resistance"),
-    (impedance.Law, "missed", "one.at(u) - piece.line(u)", "0.0 * u"),
+    (joint_laws.JointLaws, "_spring", "+ self.drift(link.dofs[i])", ""),
+    (joint_laws.JointLaws, "_limits", "(0.0, None) if inward > 0.0 else (None, 0.0)", "None, None"),
+    (joint_laws.Law, "piece", "select(over, 0.0, resistance)", "resistance"),
+    (joint_laws.Law, "is_mispredicted", "one.at(u) - piece.line(u)", "0.0 * u"),
     (step.Step, "_with_resistance", "self.h * piece.resistance", "piece.resistance"),
     (joint_space.JointSpace, "solve", "U.get((i, j), 0.0) - column[i]", "U.get((i, j), 0.0) + column[i]"),
-    (free.Free, "moved", "+ shift[i]", ""),
-    (ball, "rotated_by", "half = turn * 0.5", "half = turn"),
+    (free.Free, "integrate", "+ shift[i]", ""),
+    (ball, "rotate_by", "half = turn * 0.5", "half = turn"),
 ]
 
 
 @pytest.mark.parametrize(("owner", "name", "old", "new"), BUGS)
 def test_a_planted_bug_is_seen(monkeypatch, owner, name, old, new):
     scene = furnished(zoo.fork())
-    monkeypatch.setattr(step, "SHORT", 99 if owner is joint_space.JointSpace else 0)
+    monkeypatch.setattr(step, "MOST_JOINT_SPACE_DOFS", 99 if owner is joint_space.JointSpace else 0)
     a = states(scene, 3)
     wanted = [implicit.step(scene, w, H, *(a[n][w] for n in ("q", "qd", *FORCES))) for w in range(3)]
 
@@ -76,7 +75,7 @@ def test_passes_in_joint_space_equal_sweeps(monkeypatch, name, dtype):
     scene, results = furnished(zoo.SCENES[name]()), []
     a = states(scene, 8)
     for short in (0, 99):
-        monkeypatch.setattr(step, "SHORT", short)
+        monkeypatch.setattr(step, "MOST_JOINT_SPACE_DOFS", short)
         results.append(symbolic.advance(scene, a, H, dtype)[:2])
     for swept, short in zip(*results, strict=True):
         np.testing.assert_allclose(short, swept, rtol=0.0, atol=TOLERANCE[dtype])
@@ -88,7 +87,7 @@ def test_passes_in_joint_space_with_hinges_listed_child_first(monkeypatch):
     assert scene.hinges[-1].parent == -1 and scene.dof_count == 8
     a = states(scene, 8)
     for short in (0, 99):
-        monkeypatch.setattr(step, "SHORT", short)
+        monkeypatch.setattr(step, "MOST_JOINT_SPACE_DOFS", short)
         results.append(symbolic.advance(scene, a, H)[:2])
     for swept, short in zip(*results, strict=True):
         np.testing.assert_allclose(short, swept, rtol=0.0, atol=TOLERANCE["float64"])

@@ -6,8 +6,7 @@ import pytest
 import warp_spo as spo
 from support import implicit, symbolic, zoo
 from support.step_scenes import H, slide, slider
-from warp_spo.recursions.step import joint_laws as impedance
-from warp_spo.recursions.step import step
+from warp_spo.recursions.step import joint_laws, step
 from warp_spo.reference.dense import Dense
 
 
@@ -43,7 +42,7 @@ def test_a_damper_that_pulls_or_comes_early_is_seen(monkeypatch):
     bugs = ("d = select(less(0.0, depth), d, 0.0)", "pass"), ("(0.0, None) if inward > 0.0", "(None, None) if 1")
     for old, new in bugs:
         with monkeypatch.context() as patch:
-            symbolic.plant(patch, impedance.Impedance, "_limits", old, new)
+            symbolic.plant(patch, joint_laws.JointLaws, "_limits", old, new)
             with pytest.raises(AssertionError):
                 test_limits_push_and_never_pull()
 
@@ -59,7 +58,7 @@ def test_a_drive_saturates():
 def test_friction_sticks_and_slides():
     scene = slider(friction=4.0)
     _, qd = slide(scene, 0.0, [0.0, 0.0, 1.0, -1.0, 1e-3, 0.0], [3.9, -3.9, 0.0, 0.0, 0.0, 5.0])
-    assert (np.abs(qd[[0, 1, 4]]) <= impedance.CREEP).all()  # held, held, stopped without turning round
+    assert (np.abs(qd[[0, 1, 4]]) <= joint_laws.CREEP).all()  # held, held, stopped without turning round
     np.testing.assert_allclose(qd[[2, 3, 5]], [1.0 - H * 2.0, -1.0 + H * 2.0, H * 0.5], rtol=1e-12)
 
 
@@ -82,14 +81,14 @@ def test_friction_stays_below_its_bound(dtype, share):
     scene = scene.with_values(joint_friction=bound)
     arrays = {"q": q, "qd": qd, "tau": np.zeros_like(qd), "joint_friction": bound}
     _, after, passes = symbolic.advance(scene, arrays, H, dtype)
-    assert (passes <= 8).all() and (np.abs(after) < 2.0 * impedance.CREEP).any()
+    assert (passes <= 8).all() and (np.abs(after) < 2.0 * joint_laws.CREEP).any()
     assert (np.abs(held(after)) <= (1.0 + share) * bound).all()
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_velocity_limits(dtype):
     _, qd = slide(slider(velocity_limit=2.0), 0.0, [1.0, 1.99, 5.0, -5.0, 2.0], [0.0, 1e3, 0.0, 0.0, -1e3], dtype=dtype)
-    np.testing.assert_allclose(qd, [1.0, 2.0, 2.0, -2.0, 1.0], atol=3.1 / impedance.HOLD)
+    np.testing.assert_allclose(qd, [1.0, 2.0, 2.0, -2.0, 1.0], atol=3.1 / joint_laws.HOLD)
     assert abs(qd[4] - 1.0) < 1e-5  # braking is nothing that it resists
 
 
@@ -104,10 +103,10 @@ def weightless(count, **values):
 def balance(q, qd, tau, drive=(0.0, 0.0, np.inf), friction=0.0, limit=np.inf, limit_ke=0.0, fastest=np.inf):
     """The rate after a step at which the forces on nothing cancel, by bisection; NaN where none is bounded."""
     ke, kd, effort = drive
-    hold = impedance.HOLD * (H * ke + kd + friction / impedance.CREEP + (H * limit_ke if limit < np.inf else 0.0))
+    hold = joint_laws.HOLD * (H * ke + kd + friction / joint_laws.CREEP + (H * limit_ke if limit < np.inf else 0.0))
 
     def excess(v):
-        f = np.clip(-ke * (q + H * v) - kd * v, -effort, effort) - friction * np.clip(v / impedance.CREEP, -1.0, 1.0)
+        f = np.clip(-ke * (q + H * v) - kd * v, -effort, effort) - friction * np.clip(v / joint_laws.CREEP, -1.0, 1.0)
         f -= limit_ke * max(0.0, q + H * v - limit) if limit < np.inf else 0.0
         f -= hold * (max(v - fastest, 0.0) - max(-fastest - v, 0.0)) if fastest < np.inf else 0.0
         return -tau - f

@@ -13,12 +13,11 @@ from support.routines import ROUTINES
 from support.step_calls import bundled
 from support.step_scenes import FORCES, TOLERANCE, H, furnished, states
 from warp_spo.execution import plan
-from warp_spo.execution.segment import warp_specialized as teams
-from warp_spo.kernels import pass_loops
-from warp_spo.kernels import straight_line as straight
+from warp_spo.execution.segment import warp_specialized
+from warp_spo.kernels import pass_loops, straight_line
 from warp_spo.kernels.substeps import repeat_on_cuda
 from warp_spo.recursions.step import step as steps
-from warp_spo.recursions.step.step import SHORT, Step, by_pieces
+from warp_spo.recursions.step.step import MOST_JOINT_SPACE_DOFS, Step, by_segments
 
 WORLDS = 4
 SCENES = {
@@ -117,13 +116,13 @@ def test_laws_in_turns_or_in_statements(name, dtype, most, device, monkeypatch):
 
 def test_what_stays_a_thread_a_world(device):
     """Few dofs, and loops that are closed."""
-    assert zoo.SCENES["chain7"]().dof_count <= SHORT < scene_of("fork").dof_count
+    assert zoo.SCENES["chain7"]().dof_count <= MOST_JOINT_SPACE_DOFS < scene_of("fork").dof_count
     short = zoo.from_parents([-1, 0, 0], ["revolute", "revolute", "prismatic"], 5)
     dyn = spo.Dynamics(short, 1, device=device, granularity="segment")
     a = states(short, 2, "float32")
     step(dyn, {name: array[:1] for name, array in a.items()})
     assert "tree" in dyn.programs.described()[0]
-    assert by_pieces(scene_of("fork")) and not by_pieces(short)
+    assert by_segments(scene_of("fork")) and not by_segments(short)
 
 
 # -- warps -------------------------------------------------------------------------------------------------------------
@@ -131,7 +130,7 @@ def texts_of(monkeypatch, name, staged=False, substeps=None, **options):
     """The CUDA text of a step by warps, a state, what the step should give, and how many passes each world needs."""
     for limit in ("FEW_WORLDS", "LONG_ROWS") if staged else ():
         monkeypatch.setattr(plan, limit, 0)
-    monkeypatch.setattr(straight, "SHARED_BYTES", 1 << 20)
+    monkeypatch.setattr(straight_line, "SHARED_BYTES", 1 << 20)
     texts, scene = warp_machine.recorded(monkeypatch), scene_of(name)
     dyn = spo.Dynamics(scene, WORLDS, device="cpu", dtype="float64", granularity="segment")
     a = states(scene, WORLDS)
@@ -299,8 +298,9 @@ BUGS = {
         pass_loops, "repeat_team_passes", "going = __syncthreads_or(missed_row[0] > 0)", "going = missed_row[0] > -1"),
     "a guess that stays": (Step, "_stores_of_pass", "after = gain\n", "after = 0.0 * gain\n"),
     "a limb that is not asked": (pass_loops, "repeat_team_passes", "for warp in range(warps)", "for warp in range(1)"),
-    "a word before it is said": (teams.Team, "_in_passes", "if last and any(text_of_ranks)", "if False"),
-    "a word unheard": (Step, "_words", "select(less(worst, word), word, worst)", "word"),
+    "a word before it is said": (warp_specialized.WarpSpecializedKernel, "_in_passes",
+        "if last and any(text_of_ranks)", "if False"),
+    "a word unheard": (Step, "_send_status", "select(less(worst, word), word, worst)", "word"),
 }  # fmt: skip
 NEEDS = {"flags in one place": "roots", "a limb that is not asked": "hand"}
 

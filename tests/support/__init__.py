@@ -2,7 +2,7 @@
 
 Scenes:
     ``zoo`` (trees of every kind of hinge), ``robots``, ``mechanisms`` (closed loops), ``granularity_scenes`` and
-    ``pieces_of_trees`` (limbs side by side), ``value_scenes``, ``operator_scenes`` (weighted graphs, no robots),
+    ``segments_of_trees`` (limbs side by side), ``value_scenes``, ``operator_scenes`` (weighted graphs, no robots),
     ``operators_of_robots``, ``border`` (one scene, arrays of all kinds), ``env_scenes``.
 Joints and what drives them:
     ``custom_hinges``, ``hinge_twins`` (one mechanism written in two ways), ``geared``, ``actuated``.

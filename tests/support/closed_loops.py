@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import warp_spo as spo
-from warp_spo.dynamics.loop_analysis import Closing
+from warp_spo.dynamics.loop_analysis import ClosureEvaluator
 from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.model.tracing import Trace
 from warp_spo.trace.evaluation import evaluate
@@ -38,7 +38,7 @@ def by_embedding(scene, how, s, given=LOADED, dtype="float64"):
 
 def by_multipliers(scene, s, given=LOADED):
     """The kernel between both traces is NumPy's pseudo-inverse here."""
-    size = Closing(scene).size
+    size = ClosureEvaluator(scene).size
     shapes = {"out": (size, size), "right": (size,)}
     system = traced(scene, "loop_system", s._asdict(), given, shapes)
     found = -np.einsum("wij,wj->wi", np.linalg.pinv(system["out"], rcond=1e-11, hermitian=True), system["right"])

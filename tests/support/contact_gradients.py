@@ -6,12 +6,12 @@ which a difference across a switch is known and left out.
 
 import numpy as np
 
-from warp_spo.recursions.contact import step as contact
+from warp_spo.recursions.contact import step as contact_step
 from warp_spo.recursions.contact.ground import CORNERS, GROUND, by_cell, corner_steps
 from warp_spo.recursions.contact.points import surface_numbers
 from warp_spo.recursions.contact.secant_laws import SECANT
-from warp_spo.recursions.derivatives import contact as back
-from warp_spo.recursions.derivatives import contact_pass as one
+from warp_spo.recursions.derivatives import contact as contact_derivatives
+from warp_spo.recursions.derivatives import contact_pass
 from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.model.messages import SIZES
 from warp_spo.recursions.model.tracing import Trace
@@ -62,11 +62,11 @@ def step(scene, a, h, passes):
     """q', qd' [world, ...] and the answers of all comparisons on the way [world, comparison]."""
     arguments = tuple(name for name in a if name not in VALUES)
     trace, worlds = trace_of(scene, (*arguments, "dt", "passes")), len(a["q"])
-    stores = contact.step(trace)
+    stores = contact_step.step(trace)
     known = a | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
-    known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(trace.begin)))}
+    known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(trace.prologue)))}
     known[GROUND] = cells_of(known)
-    answers = [store(trace.begin, known, known)]
+    answers = [store(trace.prologue, known, known)]
     looped = [item for item in stores if item.array in (GAIN, SECANT)]
     for number in range(passes):
         known["pass"] = np.full((worlds, 1), float(number))
@@ -85,14 +85,14 @@ def gradient(scene, a, h, passes, cotangents, wrt, ran=None):
     """
     arguments, worlds, dofs = tuple(name for name in a if name not in VALUES), len(a["q"]), scene.dof_count
     names = (*arguments, "dt", "passes", "number")
-    laws = one.count_laws(trace_of(scene, names))
-    count = one.count_variables(Links(scene, VALUES), laws)
-    weighed = SIZES["P"] * len(one.weighed_pieces(trace_of(scene, names)))
+    laws = contact_pass.count_laws(trace_of(scene, names))
+    count = contact_pass.count_variables(Links(scene, VALUES), laws)
+    weighed = SIZES["P"] * len(contact_pass.weighed_segments(trace_of(scene, names)))
     back_names = (*names, "qdd", "solved", "q_cotangent", "qd_cotangent")
     kernels = {
-        "contact_pass": one.contact_pass(trace_of(scene, names), laws),
-        "contact_solve": back.contact_solve(trace_of(scene, back_names), laws),
-        "contact_gradient": back.contact_gradient(trace_of(scene, back_names), laws, wrt, True),
+        "contact_pass": contact_pass.contact_pass(trace_of(scene, names), laws),
+        "contact_solve": contact_derivatives.contact_solve(trace_of(scene, back_names), laws),
+        "contact_gradient": contact_derivatives.contact_gradient(trace_of(scene, back_names), laws, wrt, True),
     }
     blank = lambda *size: np.full((worlds, *size), np.nan)  # noqa: E731
     known = a | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
@@ -117,23 +117,23 @@ def gradient(scene, a, h, passes, cotangents, wrt, ran=None):
     for number in reversed(range(passes)):
         known |= {"number": np.full((worlds, 1), float(number)), "row": rows[number], "qdd_before": rates[number],
                   "qdd": rates[number + 1], "cotangent": left[number + 1]}  # fmt: skip
-        more = {f"{back.INERTIA}_out": blank(weighed)} if weighed else {}
+        more = {f"{contact_derivatives.INERTIA}_out": blank(weighed)} if weighed else {}
         found = run("contact_solve", out=blank(dofs), cotangent_out=blank(dofs + count), **more)
         solved[number], left[number] = found["out"], found["cotangent_out"]
-        inertias[number] = found.get(f"{back.INERTIA}_out")
+        inertias[number] = found.get(f"{contact_derivatives.INERTIA}_out")
     known |= {f"{name}_later": blank(*shape) for name, shape in shapes.items()}
     for number in reversed(range(passes)):
         known |= {"number": np.full((worlds, 1), float(number)), "row": rows[number], "qdd_before": rates[number],
                   "qdd": rates[number + 1], "cotangent": left[number + 1], "cotangent_came": left[number],
-                  "solved": solved[number], back.INERTIA: inertias[number]}  # fmt: skip
-        found = {back.result_name(name, wrt): blank(*shape) for name, shape in shapes.items()}
-        found |= {f"{back.HEIGHTS_AT}_bar": blank(surfaces)} if HEIGHTS in wrt else {}
+                  "solved": solved[number], contact_derivatives.INERTIA: inertias[number]}  # fmt: skip
+        found = {contact_derivatives.result_name(name, wrt): blank(*shape) for name, shape in shapes.items()}
+        found |= {f"{contact_derivatives.HEIGHTS_AT}_bar": blank(surfaces)} if HEIGHTS in wrt else {}
         run("contact_gradient", **found)
-        known |= {f"{name}_later": found[back.result_name(name, wrt)] for name in wrt}
+        known |= {f"{name}_later": found[contact_derivatives.result_name(name, wrt)] for name in wrt}
     gradients = {name: known[f"{name}_later"] for name in wrt}
     if HEIGHTS in wrt:
         by_height = np.zeros((worlds, scene.ground.heights.size))
-        cells = found[f"{back.HEIGHTS_AT}_bar"].astype(int)
+        cells = found[f"{contact_derivatives.HEIGHTS_AT}_bar"].astype(int)
         for corner, distance in enumerate(corner_steps(scene.ground)):
             np.add.at(by_height, (np.arange(worlds)[:, None], cells + distance), gradients[HEIGHTS][:, :, corner])
         gradients[HEIGHTS] = by_height.reshape(a[HEIGHTS].shape)

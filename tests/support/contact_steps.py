@@ -3,7 +3,7 @@
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.reference.contact import MANY, ContactStep
+from warp_spo.reference.contact import MIDPOINT_PASSES, ContactStep
 
 from . import symbolic
 
@@ -22,7 +22,7 @@ def by_point(at, forces):
 
 def assert_is_dense(scene, a, passes):
     """The recursion, evaluated without compiling, is the dense step in every world."""
-    compute = symbolic.contact_step if passes < MANY else symbolic.contact_step_in_rounds
+    compute = symbolic.contact_step if passes < MIDPOINT_PASSES else symbolic.midpoint_contact_step
     found = compute(scene, a, H, passes)
     for w in range(len(a["q"])):
         given = {name: a[name][w] for name in a}
@@ -32,7 +32,7 @@ def assert_is_dense(scene, a, passes):
         np.testing.assert_allclose(found["q_out"][w], q, atol=1e-10)
         force, gap = by_point(at, wanted.f)
         np.testing.assert_allclose(found["contact_f"][w], force, atol=1e-10 * max(1.0, np.abs(wanted.f).max()))
-        np.testing.assert_allclose(found["contact_gap"][w], gap, atol=1e-12 if passes < MANY else PARABOLA)
+        np.testing.assert_allclose(found["contact_gap"][w], gap, atol=1e-12 if passes < MIDPOINT_PASSES else PARABOLA)
         np.testing.assert_allclose(found["contact_excess"][w], wanted.excess, atol=1e-9 * np.abs(wanted.f).max() + 1e-9)
 
 

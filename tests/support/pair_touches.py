@@ -7,13 +7,10 @@ import numpy as np
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.kernels import hull_clipping as hull_faces
-from warp_spo.kernels import hull_distance as hulls
-from warp_spo.kernels import narrow_phase as touches
-from warp_spo.kernels import native
+from warp_spo.kernels import hull_clipping, hull_distance, narrow_phase, native
 from warp_spo.kernels.elementary import C_TYPE, NATIVE
 from warp_spo.recursions.contact.couples import Polyhedron
-from warp_spo.reference import body_contact as reference_pairs
+from warp_spo.reference import body_contact
 from warp_spo.reference.rotations import homogeneous
 from warp_spo.scene.pairs import shape_of
 
@@ -89,17 +86,17 @@ def find_touches(T, of=()) -> wp.Kernel:
     touches), with 0 for shapes with a radius, 1 for boxes and 2 + i for the hull i of ``of``; and the shapes
     [2 pair, ENTRIES].
     """
-    text = hulls.lines(FIND, bool(of)).replace("REAL", C_TYPE[T]).replace("UNROLL\n", "#pragma unroll\n")
+    text = hull_distance.lines(FIND, bool(of)).replace("REAL", C_TYPE[T]).replace("UNROLL\n", "#pragma unroll\n")
     for name, value in {
         "ENTRIES": ENTRIES,
-        "HEADER": touches.HEADER,
-        "TOGETHER": hull_faces.MOST if len(of) > 1 else touches.MOST,
+        "HEADER": narrow_phase.HEADER,
+        "TOGETHER": hull_clipping.MOST if len(of) > 1 else narrow_phase.MOST,
     }.items():
         text = text.replace(name, str(value))
     arrays = {"poses": wp.array3d[T], "pairs": wp.array2d[int], "shapes": wp.array2d[T], "touches_out": wp.array2d[T]}
     find = native.function(
         "find_touch",
-        NATIVE[C_TYPE[T]] + touches.native(T, of, long=True, faces=len(of) > 1) + text,
+        NATIVE[C_TYPE[T]] + narrow_phase.native(T, of, long=True, faces=len(of) > 1) + text,
         {"pair": int, "world": int, **arrays},
     )
 
@@ -117,12 +114,12 @@ def touches_found(device, poses, kinds, shapes, hulls, most, dtype=wp.float64):
     ``poses`` [world, 2, 7] are those of the bodies, ``shapes`` [2, ENTRIES] the shapes in them, ``hulls`` the corners
     of the hulls that ``kinds`` number.
     """
-    out = wp.full((touches.HEADER + most * touches.POINT, len(poses)), np.nan, dtype=dtype, device=device)
+    out = wp.full((narrow_phase.HEADER + most * narrow_phase.POINT, len(poses)), np.nan, dtype=dtype, device=device)
     given = [wp.array(poses, dtype=dtype, device=device), wp.array([[0, 1, *kinds, 0]], dtype=int, device=device),
              wp.array(shapes, dtype=dtype, device=device)]  # fmt: skip
     find = find_touches(dtype, tuple(map(polyhedron, hulls)))
     wp.launch(find, (1, len(poses)), given, [out], device=device)
-    return np.float64(out.numpy())[touches.HEADER :].T.reshape(len(poses), most, touches.POINT)
+    return np.float64(out.numpy())[narrow_phase.HEADER :].T.reshape(len(poses), most, narrow_phase.POINT)
 
 
 def random_shape(rng, kind):
@@ -147,9 +144,9 @@ def assert_points_are_those_of_the_reference(device, kinds, long):
     for w in range(worlds):
         both = [(kind, homogeneous(pose) @ homogeneous(row[:7]), hull.corners if kind == 2 else row[7:10], row[10])
                 for kind, pose, row in zip(kinds, poses[w], shapes, strict=True)]  # fmt: skip
-        wanted = reference_pairs.touches(*both)
+        wanted = body_contact.touches(*both)
         rows = found[w, : 8 if kinds == (1, 1) else max(1, len(wanted))]
-        rows = rows[rows[:, 6] > touches.AWAY]
+        rows = rows[rows[:, 6] > narrow_phase.AWAY]
         assert len(rows) == len(wanted)
         counts.add(len(wanted))
         found_rows = np.c_[rows[:, :3] + poses[w, 0, :3], rows[:, 3:]]

@@ -8,7 +8,7 @@ import textwrap
 import numpy as np
 
 import warp_spo
-from warp_spo.dynamics.stepping.midpoint_contact import ROUNDS
+from warp_spo.dynamics.stepping.midpoint_contact import ITERATIONS
 from warp_spo.execution.routine import Routine
 from warp_spo.recursions import (
     composite,
@@ -18,6 +18,7 @@ from warp_spo.recursions import (
     forward_dynamics,
     hybrid,
     kinematics,
+    mass_matrix_inverse,
     momentum,
     newton_euler,
     operational,
@@ -26,9 +27,8 @@ from warp_spo.recursions import (
     reactions,
     regressor,
 )
-from warp_spo.recursions import mass_matrix_inverse as inverse
 from warp_spo.recursions.contact import step as contact
-from warp_spo.recursions.contact import velocity_kicks as middle
+from warp_spo.recursions.contact import velocity_kicks
 from warp_spo.recursions.contact.ground import GROUND, by_cell
 from warp_spo.recursions.contact.secant_laws import SECANT
 from warp_spo.recursions.derivatives import adjoints, inverse_dynamics
@@ -40,7 +40,8 @@ from warp_spo.recursions.step.step import GAIN, LOOPED, MISSED, PASS
 from warp_spo.trace.evaluation import evaluate
 from warp_spo.trace.scalars import ordered as ordered
 
-TREE = (forward_dynamics, newton_euler, composite, inverse, determinant, kinematics, operational, momentum, hybrid,
+TREE = (forward_dynamics, newton_euler, composite, mass_matrix_inverse, determinant, kinematics, operational, momentum,
+        hybrid,
         quasi_velocities, reactions, step, hinge_forces, coordinates, operators, inverse_dynamics, adjoints, projection,
         multipliers, energy, regressor)  # fmt: skip
 EMBEDDED = (minimal, embedded, embedded_adjoints)
@@ -118,7 +119,7 @@ def contact_step(scene, arrays, h, passes=3, dtype="float64"):
     trace, worlds = Trace(Links(scene), dtype, (*arrays, "dt", "passes")), len(arrays["q"])
     stores = contact.step(trace, True, True, contact.REPORTS)
     known = arrays | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
-    known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(trace.begin)))}
+    known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(trace.prologue)))}
     known[GROUND] = by_cell(scene.ground.heights).ravel() if hasattr(scene.ground, "heights") else np.zeros(0)
 
     def stored(some, found):
@@ -127,7 +128,7 @@ def contact_step(scene, arrays, h, passes=3, dtype="float64"):
             found[item.array][(slice(None), *item.index)] = value
         return found
 
-    known |= stored(trace.begin, {SECANT: known[SECANT]})
+    known |= stored(trace.prologue, {SECANT: known[SECANT]})
     looped = [item for item in stores if item.array in (GAIN, SECANT)]
     for number in range(passes):
         known["pass"] = np.full((worlds, 1), float(number))
@@ -139,13 +140,17 @@ def contact_step(scene, arrays, h, passes=3, dtype="float64"):
     return stored(last, {name: np.full((worlds, *shape), np.nan) for name, shape in shapes.items()})
 
 
-def contact_step_in_rounds(scene, arrays, h, passes, dtype="float64"):
+def midpoint_contact_step(scene, arrays, h, passes, dtype="float64"):
     """The same for a step that begins with rounds, whose velocity terms are kicks."""
     start = {"q": arrays["q"], "qd": arrays["qd"], "dt": np.full((len(arrays["q"]), 1), h)}
     found, kick = {"out": arrays["qd"]}, np.zeros_like(arrays["qd"])
 
     def computed(trace, **options):
-        known = start | {middle.FOUND: found["out"], middle.KICKED: kick, middle.GAINED: found.get("qdd_out")}
+        known = start | {
+            velocity_kicks.PREVIOUS_RATES: found["out"],
+            velocity_kicks.PREVIOUS_KICK: kick,
+            velocity_kicks.PASS_ACCELERATION: found.get("qdd_out"),
+        }
         stores = trace(Trace(Links(scene), dtype, tuple(known)), **options)
         left = {name: np.full_like(arrays["qd"], np.nan) for name in ("out", "path_out", "qdd_out")}
         left["q_out"] = np.full_like(arrays["q"], np.nan)
@@ -154,12 +159,17 @@ def contact_step_in_rounds(scene, arrays, h, passes, dtype="float64"):
             left[item.array][(slice(None), *item.index)] = value
         return left
 
-    for _ in range(ROUNDS):
-        left = computed(middle.middle_kick)
+    for _ in range(ITERATIONS):
+        left = computed(velocity_kicks.first_kick)
         kick = left["out"]
-        more = {"q": left["q_out"], middle.START: arrays["q"], middle.KICK: kick, middle.PATH: left["path_out"]}
+        more = {
+            "q": left["q_out"],
+            velocity_kicks.START: arrays["q"],
+            velocity_kicks.KICK: kick,
+            velocity_kicks.PATH: left["path_out"],
+        }
         found = contact_step(scene, arrays | more, h, passes, dtype)
-    last = computed(middle.last_kick, qdd=True)
+    last = computed(velocity_kicks.final_kick, qdd=True)
     return found | {name: last[name] for name in ("out", "qdd_out")}
 
 

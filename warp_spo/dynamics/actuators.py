@@ -9,7 +9,7 @@ import warp as wp
 
 from ..errors import as_integer
 from ..execution.routine import Routine
-from ..kernels import actuator_delays as delays
+from ..kernels import actuator_delays
 from ..recursions.derivatives import adjoints
 from ..recursions.step.actuation import actuator_force as trace_of_force
 from ..runtime import launches
@@ -99,7 +99,7 @@ def actuator_state(self: Dynamics, like: Any = None, longest: int | None = None)
     slots = steps + 1 if delays_controls(self) else 0
     name = "Dynamics.actuator_state"
     kind = WARP if like is None else kind_of(like, name, "like")
-    with Call(name, self.device, self.dtype, kind=kind, turn=self.recursions.turn) as call:
+    with Call(name, self.device, self.dtype, kind=kind, call_order=self.recursions.call_order) as call:
         ring = call.write(None, (self.worlds, slots, actuators))
         count = call.write(None, (self.worlds, actuators), dtype=wp.int32)
         for array in (ring, count):
@@ -113,7 +113,7 @@ def forget_controls(dyn: Dynamics, call: Call, mask: wp.array | None, state: Any
     if mask is None:
         launches.fill(count, 0)
     elif count.size:
-        dyn.recursions.launch(delays.forget, count.shape, [mask], [count])
+        dyn.recursions.launch(actuator_delays.forget, count.shape, [mask], [count])
 
 
 def most_delay(dyn: Dynamics) -> int:
@@ -153,7 +153,7 @@ def delayed(dyn: Dynamics, ctrl: wp.array, state: tuple[wp.array, wp.array]) -> 
     ring, count = state
     out = dyn.recursions.array("delayed controls", *ctrl.shape)
     field = dyn.recursions.parameters.field("actuator_delay")
-    dyn.recursions.launch(delays.delay, ctrl.shape, [ctrl, field], [ring, count, out])
+    dyn.recursions.launch(actuator_delays.delay, ctrl.shape, [ctrl, field], [ring, count, out])
     return out
 
 

@@ -6,7 +6,7 @@ of the kernels, and the kernels are launched. Two calls are of one kind if they 
 names, arrays of the same classes and numbers that are equal. Whatever differs from the recorded call in any other way
 is a call as if nothing were recorded, which does it or says what is wrong.
 
-One call runs at a time, see :class:`warp_spo.runtime.call_order.Turn`.
+One call runs at a time, see :class:`warp_spo.runtime.call_order.CallOrder`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import warp as wp
 
 from ..runtime.arrays import CLASSES, TORCH, torch_border
 from ..runtime.autograd import call_in_graph, call_with_gradient, is_exported, is_traced, records_gradient
-from ..runtime.call_order import Turn
+from ..runtime.call_order import CallOrder
 from ..runtime.dlpack import settle
 from ..runtime.launches import Recording
 from ..runtime.launches import recording as open_recording
@@ -73,7 +73,7 @@ Repeat = Callable[[Sequence[Any]], Any]
 
 
 def _repeater(
-    device: wp.Device, turn: Turn, arrays: list, ranges: list, recording: Recording, build: Builder
+    device: wp.Device, call_order: CallOrder, arrays: list, ranges: list, recording: Recording, build: Builder
 ) -> Repeat:
     """Return a function that repeats a recorded call.
 
@@ -117,8 +117,8 @@ def _repeater(
         stream = None
         if is_cuda:
             stream = stream_of(device)
-            if stream is not turn.stream:
-                turn.order(stream)
+            if stream is not call_order.stream:
+                call_order.order(stream)
         results = []
         if makers:
             made = []
@@ -184,7 +184,7 @@ def as_written(args: tuple, more: dict[str, Any]) -> Callable[[tuple, dict[str, 
 
 
 @dataclasses.dataclass
-class Kind:
+class RecordedCalls:
     """Calls of one kind.
 
     Attributes:
@@ -199,11 +199,11 @@ class Kind:
 class Replays:
     """The recorded calls of one Dynamics."""
 
-    def __init__(self, device: wp.Device, turn: Turn):
-        self._device, self.turn = device, turn
+    def __init__(self, device: wp.Device, call_order: CallOrder):
+        self._device, self.call_order = device, call_order
         if "torch" in sys.modules:
             torch_border()  # fills CLASSES
-        self._kinds: dict[tuple, Kind] = {}
+        self._kinds: dict[tuple, RecordedCalls] = {}
         self._latest: dict[str, tuple[Any, Repeat]] = {}
 
     def forget(self) -> None:
@@ -220,14 +220,14 @@ class Replays:
             find, repeat = latest
             arrays = find(args, more)
             if arrays is not None:
-                with self.turn.lock:
+                with self.call_order.lock:
                     found = repeat(arrays)
                 if found is not MISS:
                     return found, None, []
         key, arrays = kind_of_call(name, args, more)
         kind = self._kinds.get(key) if key is not None else None
         for repeat in () if kind is None else kind.plans:
-            with self.turn.lock:
+            with self.call_order.lock:
                 found = repeat(arrays)
             if found is not MISS:
                 find = as_written(args, more)
@@ -243,7 +243,7 @@ class Replays:
             all_taken: an array that the call does not take gives it numbers, such as a tensor for dt. These are not
                 seen when the call is repeated, so it is not recorded.
         """
-        with self.turn.lock:
+        with self.call_order.lock:
             plain = not self._device.is_capturing
             if key is None or not arrays or not plain:
                 return call()
@@ -252,12 +252,12 @@ class Replays:
                 result = call()
                 if len(self._kinds) >= MOST_KINDS:
                     self._kinds.clear()
-                self._kinds[key] = Kind()
+                self._kinds[key] = RecordedCalls()
                 return result
             ranges = _ranges(arrays) if kind.tries < MOST_TRIES else None
             return call() if ranges is None else self._record(kind, arrays, ranges, call, all_taken)
 
-    def _record(self, kind: Kind, arrays: list, ranges: list, call: Callable[[], Any], all_taken: bool) -> Any:
+    def _record(self, kind: RecordedCalls, arrays: list, ranges: list, call: Callable[[], Any], all_taken: bool) -> Any:
         """Record a call and return its result."""
         kind.tries += 1
         with Recording(ranges) as recording:
@@ -266,7 +266,7 @@ class Replays:
         if all_taken and not all(any(x is other for other in recording.taken) for x in arrays):
             return result
         if recording.complete and build is not None and _lie_apart(arrays, ranges, recording.written):
-            kind.plans.append(_repeater(self._device, self.turn, arrays, ranges, recording, build))
+            kind.plans.append(_repeater(self._device, self.call_order, arrays, ranges, recording, build))
         return result
 
 

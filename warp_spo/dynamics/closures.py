@@ -24,7 +24,7 @@ from ..recursions.loops import embedded, multipliers, projection
 from ..runtime import launches
 from ..runtime.arrays import Call
 from ..scene.scene import Scene
-from .loop_analysis import Closing, embedding, usual_rank
+from .loop_analysis import ClosureEvaluator, embedding, usual_rank
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics
@@ -80,7 +80,7 @@ class Closures:
     @functools.cached_property
     def rows(self) -> int:
         """Number of rows of all closures."""
-        return Closing(self._dyn.scene).size
+        return ClosureEvaluator(self._dyn.scene).size
 
     def explain(self) -> str:
         """Return one line for :meth:`Dynamics.explain`."""
@@ -185,14 +185,16 @@ def check_loops(scene: Scene, loops: str) -> None:
     """Raise ValueError unless ``loops`` says what to do with the loops of the scene."""
     if loops not in LOOPS:
         raise ValueError(f"Dynamics: loops is {loops!r}; expected one of {', '.join(LOOPS)}")
-    if not scene.ties or loops != "raise":
+    if not scene.constraint_summary or loops != "raise":
         return
     if scene.contacts:
         raise ValueError(
-            f"Dynamics: the scene has {scene.ties}, and contacts, with which no step closes them; expected a tree; "
+            f"Dynamics: the scene has {scene.constraint_summary}, and contacts, with which no step closes "
+            f"them; expected a tree; "
             f"{AMID_CONTACTS}"
         )
     raise ValueError(
-        f"Dynamics: the scene has {scene.ties}; expected a tree; loops='cut' leaves them open, loops='embed' and "
+        f"Dynamics: the scene has {scene.constraint_summary}; expected a tree; loops='cut' leaves them open, "
+        f"loops='embed' and "
         f"loops='multipliers' close them"
     )

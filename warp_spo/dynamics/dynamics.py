@@ -36,6 +36,7 @@ from . import (
     kinematics,
     momentum,
     operational,
+    pickling,
     preparation,
     regressor,
     scene_values,
@@ -45,7 +46,6 @@ from . import (
 from . import forward_dynamics as forward
 from . import hybrid_dynamics as hybrid
 from . import inverse_dynamics as inverse
-from . import pickling as storage
 from . import quasi_velocities as quasi
 from .call_replay import Replays
 from .closures import Closures, check_loops
@@ -53,7 +53,7 @@ from .engine import Engine
 from .gradients import Gradients
 from .operation import Operation, declared
 from .refinement import Refinement
-from .stepping import contact_options as contacts
+from .stepping import contact_options
 from .stepping import step as steps
 
 if TYPE_CHECKING:
@@ -210,7 +210,7 @@ class Dynamics:
     reset = scene_values.reset
     prepare = preparation.prepare
     tune = tuning.tune
-    __reduce__ = storage.reduce
+    __reduce__ = pickling.reduce
 
     _operations: ClassVar[dict[str, Operation]]
 
@@ -237,14 +237,14 @@ class Dynamics:
         self.dtype: type[Any] = parse_dtype(dtype, "Dynamics")
         self.variable = _variable_names(variable)
         check_loops(scene, loops)
-        varies = any(name in self.variable or scene.values[name].shape[0] > 1 for name in RIGID_VALUES)
+        variable_inertia = any(name in self.variable or scene.values[name].shape[0] > 1 for name in RIGID_VALUES)
         device, precision = read_facts(self.device), self.dtype.__name__
-        self.plan = plans.choose(scene, self.worlds, device, precision, granularity, varies, recursion)
+        self.plan = plans.choose(scene, self.worlds, device, precision, granularity, variable_inertia, recursion)
         self.granularity = self.plan.granularity
         self.recursions = Sweeps(scene, self.plan, self.device, self.dtype, self.variable)
         self.programs = Programs(self.recursions, self.plan)
         self.values, self._handle = TensorValues(), register(self)
-        self._replays = Replays(self.device, self.recursions.turn)
+        self._replays = Replays(self.device, self.recursions.call_order)
         self._engine, self._gradients = Engine(self), Gradients(self)
         self._closures = Closures(self, loops, independent)
         self.closed, self.embedding = self._closures.closed, self._closures.embedding
@@ -314,7 +314,7 @@ class Dynamics:
             f"gravity      {'none' if gravity is None else 'acceleration of the inertial frame'}",
             f"loops        {self._closures.explain()}",
             f"actuators    {actuators.explain(self)}",
-            f"contacts     {contacts.explain(self)}",
+            f"contacts     {contact_options.explain(self)}",
             f"substeps     {steps.explain(self)}",
             f"workspace    {memory:.1f} MiB so far",
         ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ..errors import UnsupportedError
-from ..execution.node import operations as nodes
+from ..execution.node import operations as node_operations
 from ..execution.routine import Routine
 from ..recursions import energy as recursion
 from ..recursions.derivatives import adjoints
@@ -23,7 +23,7 @@ KINETIC_ENERGY = Operation(
     "kinetic_energy",
     arguments=(Q, required(QD)),
     results=(Result("energy", "world"),),
-    routine=Routine("kinetic_energy", recursion.kinetic_energy, nodes.kinetic_energy),
+    routine=Routine("kinetic_energy", recursion.kinetic_energy, node_operations.kinetic_energy),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,
     derivative=Derivative(
@@ -48,7 +48,7 @@ def kinetic_energy(self: Dynamics, q: ArrayT, qd: AnyArray, out: ArrayT | None =
 
 def _lacks_fixed_ground(links: Links) -> str:
     """Say what the gradient lacks: bodies that no hinge moves are no links, whose values have gradients."""
-    still = [links.nodes[body].rigid for body, seat in links.seats.items() if seat.link is None]
+    still = [links.nodes[body].rigid for body, placement in links.placements.items() if placement.link is None]
     constant = all(is_constant(x) for rigid in still for x in rigid.packed)
     return (
         "" if constant else "the gradient of the energy of bodies that do not move; keep body_mass and body_com folded"

@@ -72,7 +72,7 @@ class Engine:
                 f"Dynamics.{name}: {names} was set to a tensor that requires grad; derivatives are not available "
                 f"through this call; call inside torch.no_grad(), or set {names} to detached tensors"
             )
-        return Call(f"Dynamics.{name}", self._dyn.device, self._dyn.dtype, turn=self._dyn.recursions.turn)
+        return Call(f"Dynamics.{name}", self._dyn.device, self._dyn.dtype, call_order=self._dyn.recursions.call_order)
 
     def refuse(self, name: str, form: Operation | Derivative) -> None:
         """Raise UnsupportedError if an operation, or a derivative, has no form for the loops of this Dynamics."""

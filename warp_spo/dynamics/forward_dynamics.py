@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from ..execution import status_words as words
-from ..execution.node import operations as nodes
+from ..execution.node import operations as node_operations
 from ..execution.routine import Routine
 from ..recursions import forward_dynamics as recursion
 from ..recursions.derivatives import adjoints
@@ -64,14 +64,14 @@ FORWARD_DYNAMICS = Operation(
     routine=Routine(
         "forward_dynamics",
         recursion.forward_dynamics,
-        nodes.forward_dynamics,
+        node_operations.forward_dynamics,
         letters="Pza",
         collects=True,
-        aside=168,
+        registers_when_spilling=168,
         bias_first=Routine(
             "forward_dynamics_apart",
             recursion.forward_dynamics_bias_first,
-            nodes.forward_dynamics,
+            node_operations.forward_dynamics,
             letters="fPza",
             collects=True,
             occupancy=((4, 128), (3, 168), (2, 128)),

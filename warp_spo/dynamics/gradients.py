@@ -169,7 +169,7 @@ class Gradients:
             return
         dyn = self.dyn
         parameters = dyn.recursions.parameters
-        with Call("Dynamics.set", dyn.device, dyn.dtype, turn=dyn.recursions.turn) as call:
+        with Call("Dynamics.set", dyn.device, dyn.dtype, call_order=dyn.recursions.call_order) as call:
             arrays, before = {}, {}
             for name, value in values.items():
                 shape = dyn.scene.values[name].shape[1:]

@@ -15,7 +15,7 @@ from ..recursions.loops import minimal
 from ..runtime import launches
 from ..runtime.arrays import AnyArray, ArrayT, Call, shape_of
 from ..runtime.memory import broadcast_worlds
-from . import trial_inputs as samples
+from . import trial_inputs
 from .operation import BODY_F, QD, QDD, TAU, USE_EMBED, Operation, Option, Q, Result, Trial
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ HYBRID_DYNAMICS = Operation(
         QD,
         TAU,
         QDD,
-        Option("prescribed", default=lambda scene: [False] * scene.dof_count, sample=samples.every_other),
+        Option("prescribed", default=lambda scene: [False] * scene.dof_count, sample=trial_inputs.every_other),
         BODY_F,
     ),
     results=(Result("qdd", "world, dof"), Result("tau", "world, dof")),

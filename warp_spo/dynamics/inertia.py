@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..execution.node import operations as nodes
+from ..execution.node import operations as node_operations
 from ..execution.routine import Routine
-from ..recursions import composite, determinant
-from ..recursions import forward_dynamics as solving
+from ..recursions import composite, determinant, forward_dynamics
 from ..recursions import mass_matrix_inverse as inverse
 from ..recursions.derivatives import adjoints
 from ..recursions.loops import minimal
@@ -29,7 +28,7 @@ MASS_MATRIX = Operation(
     "mass_matrix",
     arguments=(Q,),
     results=(Result("mass", "world, independent dof, independent dof"),),
-    routine=Routine("mass_matrix", composite.mass_matrix, nodes.mass_matrix, letters="R", long_result=True),
+    routine=Routine("mass_matrix", composite.mass_matrix, node_operations.mass_matrix, letters="R", long_result=True),
     embed=Routine("embedded_mass_matrix", minimal.mass_matrix),
     multipliers=AS_WRITTEN,
     derivative=Derivative(Routine("mass_matrix_vjp", adjoints.mass_matrix_vjp), by=("q",)),
@@ -54,7 +53,11 @@ MASS_MATRIX_INVERSE = Operation(
     arguments=(Q,),
     results=(Result("inverse", "world, independent dof, independent dof"),),
     routine=Routine(
-        "mass_matrix_inverse", inverse.mass_matrix_inverse, nodes.mass_matrix_inverse, letters="PNDVY", long_result=True
+        "mass_matrix_inverse",
+        inverse.mass_matrix_inverse,
+        node_operations.mass_matrix_inverse,
+        letters="PNDVY",
+        long_result=True,
     ),
     embed=Routine("embedded_mass_matrix_inverse", minimal.mass_matrix_inverse),
     multipliers=AS_WRITTEN,
@@ -96,8 +99,8 @@ SOLVE_MASS_MATRIX = Operation(
     results=(Result("x", "world, independent dof", like="b"),),
     routine=Routine(
         "solve_mass_matrix",
-        solving.solve_mass_matrix,
-        nodes.solve_mass_matrix,
+        forward_dynamics.solve_mass_matrix,
+        node_operations.solve_mass_matrix,
         letters="Pza",
         velocities=False,
         occupancy=((4, 128),),
@@ -142,7 +145,7 @@ def solve_mass_matrix(self: Dynamics, q: ArrayT, b: AnyArray, out: ArrayT | None
         elif x.ndim == 3 and self.scene.shares_dofs:
             _solve_one_by_one(self, **given, out=x)
         elif x.ndim == 3:
-            nodes.solve_mass_matrix(self.recursions, x, **given)
+            node_operations.solve_mass_matrix(self.recursions, x, **given)
         else:
             engine.launch(SOLVE_MASS_MATRIX, x, **given)
     return call.result
@@ -245,7 +248,7 @@ LOG_DET_MASS_MATRIX = Operation(
     "log_det_mass_matrix",
     arguments=(Q,),
     results=(Result("log_det", "world"),),
-    routine=Routine("log_det_mass_matrix", determinant.log_det_mass_matrix, nodes.log_det_mass_matrix),
+    routine=Routine("log_det_mass_matrix", determinant.log_det_mass_matrix, node_operations.log_det_mass_matrix),
     embed=Routine("embedded_log_det_mass_matrix", minimal.log_det_mass_matrix),
     multipliers=AS_WRITTEN,
     # its absolute error is the relative error of the determinant

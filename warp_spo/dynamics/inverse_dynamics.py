@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import UnsupportedError
-from ..execution.node import operations as nodes
+from ..execution.node import operations as node_operations
 from ..execution.routine import Routine
 from ..recursions import newton_euler, reactions
 from ..recursions.derivatives import adjoints
@@ -39,14 +39,14 @@ if TYPE_CHECKING:
     from .gradients import Gradients
 
 WEIGHT_FLOOR = 1e-2  # gravity does not act on some hinges: compare with at least this share of the weight, at 1 m
-BY_PIECES = ("q", "tangent", "qd", "qdd", "tau")  # arguments whose gradient a limb computes by itself
+BY_SEGMENTS = ("q", "tangent", "qd", "qdd", "tau")  # arguments whose gradient a limb computes by itself
 DQ = Argument("dq", "world, dof", optional=True, direction=True)
 FORCES = (Result("tau", "world, independent dof"),)
 
 
 def divides_backwards(scene: Any, inputs: Any, wrt: tuple[str, ...] = (), **_: Any) -> bool:
     """Return whether limbs can share a Newton-Euler recursion in reverse."""
-    return "body_f" not in inputs and set(wrt) <= set(BY_PIECES)
+    return "body_f" not in inputs and set(wrt) <= set(BY_SEGMENTS)
 
 
 def _title(inputs: tuple[str, ...], *_: Any) -> str:
@@ -69,18 +69,18 @@ def _weight_floor(dense: Any, expected: np.ndarray) -> float:
 RECURSION = Routine(
     "inverse_dynamics",
     newton_euler.inverse_dynamics,
-    nodes.inverse_dynamics,
+    node_operations.inverse_dynamics,
     letters="z",
     short=True,
     title=_title,
 )
 EMBEDDED_RECURSION = Routine("embedded_inverse_dynamics", minimal.inverse_dynamics)
-WAY_BACK = Routine("inverse_dynamics_vjp", adjoints.inverse_dynamics_vjp, letters="B", divides=divides_backwards)
-EMBEDDED_WAY_BACK = Routine("embedded_inverse_dynamics_vjp", embedded_adjoints.inverse_dynamics_vjp)
+PULLBACK = Routine("inverse_dynamics_vjp", adjoints.inverse_dynamics_vjp, letters="B", divides=divides_backwards)
+EMBEDDED_PULLBACK = Routine("embedded_inverse_dynamics_vjp", embedded_adjoints.inverse_dynamics_vjp)
 
 
 def _derivative(*by: str) -> Derivative:
-    return Derivative(WAY_BACK, by, embed=EMBEDDED_WAY_BACK, multipliers=EMBEDDED_DERIVATIVE, pull=_pull)
+    return Derivative(PULLBACK, by, embed=EMBEDDED_PULLBACK, multipliers=EMBEDDED_DERIVATIVE, pull=_pull)
 
 
 INVERSE_DYNAMICS = Operation(
@@ -167,8 +167,8 @@ INVERSE_DYNAMICS_VJP = Operation(
     "inverse_dynamics_vjp",
     arguments=(Q, QD, QDD, BODY_F, Argument("cotangent", "world, independent dof")),
     results=(),
-    routine=WAY_BACK,
-    embed=EMBEDDED_WAY_BACK,
+    routine=PULLBACK,
+    embed=EMBEDDED_PULLBACK,
     multipliers=EMBEDDED_DERIVATIVE,
     product=True,
 )

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from ..errors import UnsupportedError, as_integer
-from ..execution import multi_start as searches
+from ..execution import multi_start
 from ..execution.routine import Routine
 from ..kernels import declare
 from ..kernels import multi_start as kernels
@@ -133,7 +133,7 @@ def inverse_kinematics(
         assert program is not None
         found = self.recursions.array(("found", seeds), self.scene.coord_count, seeds, self.worlds)
         errors = self.recursions.array(("errors", seeds), seeds, self.worlds)
-        searches.launch(
+        multi_start.launch(
             self.programs, program, given["angle_weight"], given["iterations"], arrays, found, errors, *results
         )
     return call.result

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ..execution.node import operations as nodes
+from ..execution.node import operations as node_operations
 from ..execution.routine import Routine
 from ..recursions import kinematics as recursion
 from ..recursions import reactions
@@ -50,7 +50,7 @@ BODY_POSES = Operation(
     "body_poses",
     arguments=(Q,),
     results=(POSES,),
-    routine=Routine("body_poses", recursion.body_poses, nodes.body_poses, suits=_anchors_fixed),
+    routine=Routine("body_poses", recursion.body_poses, node_operations.body_poses, suits=_anchors_fixed),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,
     derivative=Derivative(
@@ -79,7 +79,7 @@ BODY_VELOCITIES = Operation(
     "body_velocities",
     arguments=(Q, required(QD)),
     results=(VELOCITIES,),
-    routine=Routine("body_velocities", recursion.body_velocities, nodes.body_velocities),
+    routine=Routine("body_velocities", recursion.body_velocities, node_operations.body_velocities),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,
     derivative=Derivative(
@@ -108,7 +108,7 @@ BODY_STATES = Operation(
     arguments=(Q, required(QD)),
     results=(POSES, VELOCITIES),
     routine=Routine(
-        "body_states", recursion.body_states, nodes.body_states, suits=_anchors_fixed, alone=True, wide=True
+        "body_states", recursion.body_states, node_operations.body_states, suits=_anchors_fixed, alone=True, wide=True
     ),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,
@@ -136,7 +136,7 @@ FRAME_POSES = Operation(
     "frame_poses",
     arguments=(Q, ORIENTED_FRAMES),
     results=(Result("poses", "world, frame, 7", quaternions=lambda scene: [3, 10]),),  # of the two frames of trials
-    routine=Routine("frame_poses", recursion.frame_poses, nodes.frame_poses, suits=_anchors_fixed),
+    routine=Routine("frame_poses", recursion.frame_poses, node_operations.frame_poses, suits=_anchors_fixed),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,
     derivative=Derivative(
@@ -173,7 +173,7 @@ FRAME_VELOCITIES = Operation(
     "frame_velocities",
     arguments=(Q, required(QD), FRAMES),
     results=(Result("velocities", "world, frame, 6"),),
-    routine=Routine("frame_velocities", recursion.frame_velocities, nodes.frame_velocities),
+    routine=Routine("frame_velocities", recursion.frame_velocities, node_operations.frame_velocities),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,
     derivative=Derivative(
@@ -212,7 +212,7 @@ JACOBIAN = Operation(
     "jacobian",
     arguments=(Q, FRAMES),
     results=(Result("jacobian", "world, frame, 6, independent dof"),),
-    routine=Routine("jacobian", recursion.jacobian, nodes.jacobian),
+    routine=Routine("jacobian", recursion.jacobian, node_operations.jacobian),
     embed=Routine("embedded_jacobian", minimal.jacobian),
     multipliers=AS_WRITTEN,
     derivative=Derivative(Routine("jacobian_vjp", adjoints.jacobian_vjp), by=("q",), values=KINEMATIC),

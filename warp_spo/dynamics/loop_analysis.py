@@ -32,7 +32,7 @@ NAMED = 6  # bodies that an error lists
 MOST_DOFS = 32  # of a cluster: its D costs their cube, in straight-line code
 
 
-class Closing:
+class ClosureEvaluator:
     """The closures of a scene in one world, evaluated by NumPy at many configurations.
 
     Attributes:
@@ -111,7 +111,7 @@ def drawn(scene: Scene, count: int, seed: int = 0) -> np.ndarray:
 
 def usual_rank(scene: Scene) -> int:
     """Independent rows where the loops close, but for change points; 0 if no configuration that closes was found."""
-    closing = Closing(scene)
+    closing = ClosureEvaluator(scene)
     q = closing.closed(drawn(scene, SAMPLES))
     if len(q) == 0 or closing.size == 0:
         return 0
@@ -130,7 +130,7 @@ def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str 
         UnsupportedError: more dofs in a cluster than straight-line code is good for.
     """
     wanted = None if asked is None else _numbers(scene, asked, call)
-    closing = Closing(scene)
+    closing = ClosureEvaluator(scene)
     clusters = closing.clusters
     for cluster in clusters:
         if len(cluster.dofs) > MOST_DOFS:
@@ -144,7 +144,7 @@ def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str 
     q = closing.closed(drawn(scene, SAMPLES))
     if len(q) == 0:
         raise ValueError(
-            f"{call}: no configuration was found that closes {scene.ties}; expected anchors that can "
+            f"{call}: no configuration was found that closes {scene.constraint_summary}; expected anchors that can "
             f"meet; loops='cut' leaves them open"
         )
     Y = closing.at(q)[1]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..execution.node import operations as nodes
+from ..execution.node import operations as node_operations
 from ..execution.routine import Routine
 from ..recursions import momentum as recursion
 from ..recursions.derivatives import adjoints
@@ -24,7 +24,7 @@ COM = Operation(
     "com",
     arguments=(Q,),
     results=(Result("com", "world, 3"),),
-    routine=Routine("com", recursion.com, nodes.com),
+    routine=Routine("com", recursion.com, node_operations.com),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,
     derivative=Derivative(
@@ -48,7 +48,7 @@ COM_VELOCITY = Operation(
     "com_velocity",
     arguments=(Q, required(QD)),
     results=(Result("velocity", "world, 3"),),
-    routine=Routine("com_velocity", recursion.com_velocity, nodes.com_velocity),
+    routine=Routine("com_velocity", recursion.com_velocity, node_operations.com_velocity),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,
     derivative=Derivative(

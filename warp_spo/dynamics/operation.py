@@ -47,7 +47,7 @@ from ..runtime.dlpack import settle
 from ..scene.contacts import CONTACT_VALUES, HEIGHTS
 from ..scene.frames import check_frames, origins
 from ..scene.scene import Scene
-from . import trial_inputs as samples
+from . import trial_inputs
 from .call_replay import MISS, dispatch
 
 if TYPE_CHECKING:
@@ -187,13 +187,15 @@ ORIENTED_FRAMES = Option(
     "frames",
     lambda scene, call, frames: check_frames(scene, call.name, frames),
     lambda scene: [0],
-    sample=samples.two_frames,
+    sample=trial_inputs.two_frames,
 )
 FRAMES = dataclasses.replace(
     ORIENTED_FRAMES,
     read=lambda scene, call, frames: origins(check_frames(scene, call.name, frames)),  # their axes do not enter
 )
-DT = Option("dt", lambda scene, call, dt: seconds(call, dt), lambda scene: STAND_IN, False, lambda scene: samples.DT)
+DT = Option(
+    "dt", lambda scene, call, dt: seconds(call, dt), lambda scene: STAND_IN, False, lambda scene: trial_inputs.DT
+)
 
 
 # -- closed loops ------------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ..execution.node import operations as nodes
+from ..execution.node import operations as node_operations
 from ..execution.routine import Routine
 from ..kernels import cholesky
 from ..recursions import operational as recursion
@@ -22,7 +22,9 @@ OPERATIONAL_INERTIA_INVERSE = Operation(
     arguments=(Q, FRAMES),
     results=(Result("inverse", "world, 6 frames, 6 frames"),),
     routine=Routine(
-        "operational_inertia_inverse", recursion.operational_inertia_inverse, nodes.operational_inertia_inverse
+        "operational_inertia_inverse",
+        recursion.operational_inertia_inverse,
+        node_operations.operational_inertia_inverse,
     ),
     embed=Routine("embedded_operational_inertia_inverse", minimal.operational_inertia_inverse),
     multipliers=USE_EMBED,

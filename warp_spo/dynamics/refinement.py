@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ..execution import status_words as words
+from ..execution import status_words
 from ..kernels import refinement as kernels
 from ..runtime import launches
 from .forward_dynamics import FORWARD_DYNAMICS
@@ -34,7 +34,7 @@ class Refinement:
         self.steps = steps
         other = "float64" if dyn.dtype is wp.float32 else "float32"
         granularity = dyn.granularity if dyn.plan.forced else None
-        recursion = "scan" if dyn.plan.forced and dyn.plan.stretch else None
+        recursion = "scan" if dyn.plan.forced and dyn.plan.block_length else None
         own = dyn.scene, dyn.worlds, dyn.device, other, dyn.variable, granularity, "cut"
         twin = type(dyn)(*own, recursion=recursion)
         twin.recursions.parameters.share(dyn.recursions.parameters)
@@ -50,7 +50,7 @@ class Refinement:
         swept = narrow._engine.launch(FORWARD_DYNAMICS, x, tau=right, **low)
         if status is not None:
             found = low["q"], low["qd"], right, low["body_f"], x, status
-            words.write(narrow.recursions, *found, factored=swept)
+            status_words.write(narrow.recursions, *found, factored=swept)
         self._refine(low["q"], x, tau, out, **high)
 
     def solve_mass_matrix(self, q: wp.array, b: wp.array, out: wp.array) -> None:

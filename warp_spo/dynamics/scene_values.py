@@ -46,7 +46,7 @@ def set_values(self: Dynamics, *, worlds: AnyArray | None = None, **values: Any)
     """
     folded: dict[str, Any] = {}
     settle((worlds, *values.values()))
-    with Call("Dynamics.set", self.device, self.dtype, turn=self.recursions.turn) as call:
+    with Call("Dynamics.set", self.device, self.dtype, call_order=self.recursions.call_order) as call:
         variable: dict[str, Any] = {}
         chosen = None if worlds is None else read_mask(call, "worlds", worlds, self.worlds)
         for name, value in values.items():
@@ -120,7 +120,7 @@ def reset(
         TypeError, ValueError: as every call; q, qd must not overlap the other arrays.
     """
     settle((mask, q, qd, q_from, qd_from))
-    with Call("Dynamics.reset", self.device, self.dtype, turn=self.recursions.turn) as call:
+    with Call("Dynamics.reset", self.device, self.dtype, call_order=self.recursions.call_order) as call:
         chosen = read_mask(call, "mask", mask, self.worlds)
         sizes = (self.scene.coord_count, "coordinate"), (self.scene.dof_count, "dof")
         targets = [
@@ -148,7 +148,7 @@ def reset_actuator_state(self: Dynamics, mask: AnyArray | None, state: actuators
         state: buffers of :meth:`actuator_state`; changed in place.
     """
     settle((mask,))
-    with Call("Dynamics.reset_actuator_state", self.device, self.dtype, turn=self.recursions.turn) as call:
+    with Call("Dynamics.reset_actuator_state", self.device, self.dtype, call_order=self.recursions.call_order) as call:
         chosen = None if mask is None else read_mask(call, "mask", mask, self.worlds)
         call.order()
         actuators.forget_controls(self, call, chosen, state)

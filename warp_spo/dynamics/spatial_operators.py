@@ -108,7 +108,7 @@ class SpatialOperators(LetterOwner):
         """Take the coordinates ``q`` [world, coordinate]; launches only."""
         run = self._recursions
         settle((q,))
-        with Call("operators.update", run.device, run.dtype, turn=run.turn) as call:
+        with Call("operators.update", run.device, run.dtype, call_order=run.call_order) as call:
             q = call.read("q", q, (run.worlds, run.scene.coord_count), "[world, coordinate]")
             self._kind = call.kind
             call.order()
@@ -126,7 +126,7 @@ class SpatialOperators(LetterOwner):
         capturing, stamp = self._recursions.device.is_capturing, self._recursions.parameters.version
         if self._fused and (stamp is None or self._filled != stamp or self._captured or capturing):
             self._filled = None if capturing else stamp
-            with self._recursions.turn.lock:
+            with self._recursions.call_order.lock:
                 self._write_blocks(self._q)
 
     def _write_blocks(self, q: wp.array) -> None:
@@ -176,7 +176,7 @@ class SpatialOperators(LetterOwner):
     def frames(self) -> Any:
         """Pose of every node frame in the inertial frame, x, y, z, quaternion xyzw [world, node, 7]; the kind of q."""
         run = self._recursions
-        with Call("operators.frames", run.device, run.dtype, kind=self._kind, turn=run.turn) as call:
+        with Call("operators.frames", run.device, run.dtype, kind=self._kind, call_order=run.call_order) as call:
             out = call.write(None, (run.worlds, run.scene.body_count, 7))
             self.fill()
             launches.copy(out, self._frames)
@@ -290,7 +290,7 @@ class SimilarOperators(LetterOwner):
     def fill(self) -> None:
         source = self._source
         capturing = source.H.device.is_capturing
-        with source._recursions.turn.lock:
+        with source._recursions.call_order.lock:
             source.fill()
             if self._seen != source._fillings or source._captured or capturing:
                 self._factorization.update()

@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from ..errors import UnsupportedError, as_names
-from ..execution import tuned as files
+from ..execution import tuned
 from ..execution.plan import choose
 from ..execution.routine import Routine
 from ..execution.tuned import Tuned
@@ -79,7 +79,7 @@ def tune(self: Dynamics, operations: Sequence[str] | None = None) -> dict[str, T
             known = ", ".join(name for name, one in self._operations.items() if one.routine and not one.product)
             raise ValueError(f"Dynamics.tune: operations names {name!r}; expected some of {known}")
         try:
-            with self.recursions.turn.lock:  # calls of other threads would be timed, too
+            with self.recursions.call_order.lock:  # calls of other threads would be timed, too
                 found[name] = _tune_one(self, operation)
         except UnsupportedError:
             if operations is not None:
@@ -105,15 +105,15 @@ def _tune_one(dyn: Dynamics, operation: Operation) -> Tuned:
 
 def _tune_recursion(dyn: Dynamics) -> dict[str, Tuned]:
     """Choose between sweeps and scans where both serve; return the choice by its name."""
-    stretches, operation = dyn.plan.stretches(dyn.scene), dyn._operations[USUAL[0]]
+    block_lengths, operation = dyn.plan.block_lengths(dyn.scene), dyn._operations[USUAL[0]]
     try:
         dyn._engine.refuse(operation.name, operation)
     except UnsupportedError:
         return {}
-    if len(stretches) == 1:
+    if len(block_lengths) == 1:
         return {}
-    with dyn.recursions.turn.lock:
-        return {RECURSION: _choose(dyn, RECURSION, tuple(stretches), lambda: _measure_recursion(dyn, operation))}
+    with dyn.recursions.call_order.lock:
+        return {RECURSION: _choose(dyn, RECURSION, tuple(block_lengths), lambda: _measure_recursion(dyn, operation))}
 
 
 def _choose(dyn: Dynamics, name: str, candidates: Sequence[str], measure: Callable[[], dict[str, float]]) -> Tuned:
@@ -121,13 +121,13 @@ def _choose(dyn: Dynamics, name: str, candidates: Sequence[str], measure: Callab
     if name in dyn.plan.tuned:
         return dyn.plan.tuned[name]
     key = _key(dyn, name)
-    choice = files.read(key, candidates)
+    choice = tuned.read(key, candidates)
     if choice is None:
         us = measure()
-        best = files.choice_of(us, candidates[0])
+        best = tuned.choice_of(us, candidates[0])
         now = Tuned(best, us, dyn.plan.device.name, f"{datetime.date.today()}", measured=True)
-        choice = files.read(key, candidates, warn=False)  # another process may have been faster
-        choice = files.write(key, now) if choice is None else choice
+        choice = tuned.read(key, candidates, warn=False)  # another process may have been faster
+        choice = tuned.write(key, now) if choice is None else choice
     use(dyn, name, choice)
     return choice
 
@@ -145,7 +145,7 @@ def _routine(dyn: Dynamics, operation: Operation) -> Routine:
 def use(dyn: Dynamics, name: str, choice: Tuned) -> None:
     """Let the routine of this name, or the sweeps, run by a choice from now on."""
     if name == RECURSION:
-        _switch_recursion(dyn, dyn.plan.stretches(dyn.scene)[choice.granularity])
+        _switch_recursion(dyn, dyn.plan.block_lengths(dyn.scene)[choice.granularity])
     else:
         _switch(dyn, name, choice.granularity)
     dyn.plan.tuned[name] = choice
@@ -159,17 +159,17 @@ def _switch(dyn: Dynamics, name: str, granularity: str | None) -> None:
     routines = [one for one in every if one.name == name]
     names = {name, *(one.bias_first.name for one in routines if one.bias_first is not None)}
     for each in names:
-        plan.instead.pop(each, None)
+        plan.tuned_plans.pop(each, None)
     if granularity is not None and any(plan.of(one) != granularity for one in routines):
-        asked = choose(dyn.scene, dyn.worlds, plan.device, plan.dtype, granularity, plan.varies)
-        plan.instead.update(dict.fromkeys(names, asked))
+        asked = choose(dyn.scene, dyn.worlds, plan.device, plan.dtype, granularity, plan.variable_inertia)
+        plan.tuned_plans.update(dict.fromkeys(names, asked))
     dyn._replays.forget()
     dyn._gradients.forget()
 
 
-def _switch_recursion(dyn: Dynamics, stretch: int) -> None:
-    """Let sweeps run as if the plan had this stretch."""
-    dyn.recursions.use_stretch(stretch)
+def _switch_recursion(dyn: Dynamics, block_length: int) -> None:
+    """Let sweeps run as if the plan had this block length."""
+    dyn.recursions.use_block_length(block_length)
     dyn._replays.forget()
     dyn._gradients.forget()
 
@@ -208,15 +208,15 @@ def _measure(dyn: Dynamics, operation: Operation, routine: Routine, candidates: 
 
 
 def _measure_recursion(dyn: Dynamics, operation: Operation) -> dict[str, float]:
-    """Return the time of one call of an operation [us] by the names of stretches."""
+    """Return the time of one call of an operation [us] by the names of block lengths."""
     given, us = _inputs(dyn, operation), {}
     out = operation.entry(dyn, **given)
     try:
-        for name, stretch in dyn.plan.stretches(dyn.scene).items():
-            _switch_recursion(dyn, stretch)
+        for name, block_length in dyn.plan.block_lengths(dyn.scene).items():
+            _switch_recursion(dyn, block_length)
             us[name] = 1e6 * _seconds(functools.partial(operation.entry, dyn, **given, out=out), dyn.device)
     finally:
-        _switch_recursion(dyn, dyn.plan.stretch)
+        _switch_recursion(dyn, dyn.plan.block_length)
     return us
 
 

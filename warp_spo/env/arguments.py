@@ -51,12 +51,12 @@ def checked_scene(scene: Any) -> Scene:
     """Return a scene; TypeError for anything else, UnsupportedError for one with closed loops or couplings."""
     if not isinstance(scene, Scene):
         raise TypeError(f"Env: scene is {type(scene).__name__}; expected spo.Scene")
-    if scene.ties:
+    if scene.constraint_summary:
         way_out = (
             "pass scene.without_loops(), and hold followers by drives, as the page on closed loops says; "
             "spo.Dynamics(scene, loops=...) closes them outside of environments"
         )
-        raise UnsupportedError("Env", f"a scene with {scene.ties}", way_out)
+        raise UnsupportedError("Env", f"a scene with {scene.constraint_summary}", way_out)
     return scene
 
 
@@ -105,21 +105,21 @@ def checked_parts(actions: Any) -> list[Any]:
 def checked_actions(call: str, actions: Any, worlds: int, labels: list[str]) -> torch.Tensor:
     """Return actions [world, action] as a tensor; TypeError or ValueError if they are none, or require grad."""
     try:
-        given = torch.as_tensor(actions)
+        tensor = torch.as_tensor(actions)
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"{call}: actions is {type(actions).__name__}; expected a tensor or an array") from None
-    if tuple(given.shape) != (worlds, len(labels)) or given.is_complex():
-        kind = "complex numbers of " if given.is_complex() else ""
+    if tuple(tensor.shape) != (worlds, len(labels)) or tensor.is_complex():
+        kind = "complex numbers of " if tensor.is_complex() else ""
         raise ValueError(
-            f"{call}: actions has {kind}shape {tuple(given.shape)}; expected ({worlds}, {len(labels)}) "
+            f"{call}: actions has {kind}shape {tuple(tensor.shape)}; expected ({worlds}, {len(labels)}) "
             f"[world, action]: {', '.join(map(shown, labels))}"
         )
-    if given.requires_grad and torch.is_grad_enabled():
+    if tensor.requires_grad and torch.is_grad_enabled():
         raise ValueError(
             f"{call}: actions requires grad; expected a tensor without, because a step of an environment has no "
             "gradient; call it inside torch.no_grad(), or pass actions.detach(); Dynamics.step has gradients"
         )
-    return given
+    return tensor
 
 
 def checked_mask(call: str, mask: Any, worlds: int, device: torch.device) -> torch.Tensor:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from ..errors import never_copied
-from . import arguments as checks
+from . import arguments
 from .commands import LEVEL
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def write_lengths(self: Env, value: torch.Tensor) -> None:
     """Set steps since the starts of episodes; where they change, the log leaves the length of the episode out."""
     lengths = self._tensors["episode_length"]
     before = lengths.clone()
-    lengths.copy_(checks.checked_lengths("Env.episode_length_buf", value, self.num_envs))
+    lengths.copy_(arguments.checked_lengths("Env.episode_length_buf", value, self.num_envs))
     self._log.write_ages(self._tensors["memory"], lengths != before)
 
 

@@ -18,12 +18,11 @@ from ..runtime.arrays import parse_device
 from ..runtime.launches import compile_side_by_side
 from ..runtime.torch_tensors import stream
 from ..scene.scene import Scene
-from . import arguments
-from . import checkpoint as saving
+from . import arguments, checkpoint
 from .compile.buffers import Storage
 from .compile.cuda_graphs import Part, Replay, run_all
 from .compile.fused_kernel import Launch
-from .compile.memory_layout import Layout
+from .compile.memory_layout import MemoryLayout
 from .compile.step_kernels import Tracing
 from .episode_log import Log, describe, explain
 from .events import Delays, Values, changed_values
@@ -121,7 +120,7 @@ class Env(VecEnv):
         self._steps = 0
         default = arguments.checked_default(scene, default_q)
         terms = arguments.checked_terms(observations, rewards, terminations or {}, events)
-        self._layout = Layout(scene, default, self.step_dt, commands, changed_values(scene, events))
+        self._layout = MemoryLayout(scene, default, self.step_dt, commands, changed_values(scene, events))
         tracing = self._trace(arguments.checked_parts(actions), *terms, commands, events)
         variable = self._layout.values
         self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=variable, granularity=granularity)
@@ -152,7 +151,7 @@ class Env(VecEnv):
         tracing.run(self.max_episode_length, self.final)
         self.reward_names, self.termination_names = list(rewards), tracing.ends
         self.observation_terms = tracing.observation_terms
-        self.num_obs, self._levels = tracing.group_sizes, saving.level_names(events, commands)
+        self.num_obs, self._levels = tracing.group_sizes, checkpoint.level_names(events, commands)
         self._values_later = any(isinstance(event, Values) and event.when != "start" for event in events)
         return tracing
 
@@ -188,7 +187,7 @@ class Env(VecEnv):
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: torch.Tensor) -> None:
-        saving.write_lengths(self, value)
+        checkpoint.write_lengths(self, value)
 
     @property
     def default_q(self) -> np.ndarray:
@@ -291,11 +290,11 @@ class Env(VecEnv):
         """Do nothing: memory is freed with the object."""
 
     # -- state outside of it ---------------------------------------------------------------------------------------
-    levels = saving.levels
-    start_at = saving.start_at
-    state_dict = saving.state_dict
-    load_state_dict = saving.load_state_dict
-    __reduce__, __repr__ = saving.reduce, describe
+    levels = checkpoint.levels
+    start_at = checkpoint.start_at
+    state_dict = checkpoint.state_dict
+    load_state_dict = checkpoint.load_state_dict
+    __reduce__, __repr__ = checkpoint.reduce, describe
 
     # -- inside ----------------------------------------------------------------------------------------------------
     def _observations(self, out: torch.Tensor, kind: str = "") -> Any:

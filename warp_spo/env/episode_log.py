@@ -8,7 +8,7 @@ import torch
 
 from ..errors import shown
 from .compile.fused_kernel import Launch
-from .compile.memory_layout import Layout
+from .compile.memory_layout import MemoryLayout
 from .compile.step_kernels import CAUSES
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ class Log:
         layout: where the memory is. rewards, ends: names. device: of the memory. worlds: their number.
     """
 
-    def __init__(self, layout: Layout, rewards: list[str], ends: list[str], device: torch.device, worlds: int):
+    def __init__(self, layout: MemoryLayout, rewards: list[str], ends: list[str], device: torch.device, worlds: int):
         means = {f"/reward/{name}": f"last reward {name}" for name in rewards}
         means |= {f"/termination/{name}": f"last end {name}" for name in ends}
         means["/episode/seconds"] = "last seconds"

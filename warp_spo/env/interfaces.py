@@ -31,7 +31,7 @@ def make_vector(env: Env, tensors: bool = False) -> Any:
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 
-    class Worlds(VectorEnv):
+    class VectorWorlds(VectorEnv):
         """All worlds of an ``Env``; a world whose episode ends starts anew in the same step."""
 
         metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
@@ -65,7 +65,7 @@ def make_vector(env: Env, tensors: bool = False) -> Any:
             plain = parts if tensors else tuple(part.cpu().numpy() for part in parts)
             return _plain(env, observed, tensors), *plain, info
 
-    return Worlds()
+    return VectorWorlds()
 
 
 def make_single(env: Env) -> Any:
@@ -78,7 +78,7 @@ def make_single(env: Env) -> Any:
             f"Env(scene, worlds=1, final_observations=True, ...)"
         )
 
-    class World(gymnasium.Env):
+    class SingleWorldEnv(gymnasium.Env):
         """One world; it stays where its episode ended until it is reset."""
 
         metadata = {"render_modes": []}  # noqa: RUF012
@@ -107,7 +107,7 @@ def make_single(env: Env) -> Any:
             found = _plain(env, observed, False)
             return {name: x[0] for name, x in found.items()} if isinstance(found, dict) else found[0]
 
-    return World()
+    return SingleWorldEnv()
 
 
 def make_skrl(env: Env, observations: str | None = None, states: str | None = None) -> Any:
@@ -122,7 +122,7 @@ def make_skrl(env: Env, observations: str | None = None, states: str | None = No
             raise ValueError(f"env.skrl: unknown group {name!r}; expected one of {', '.join(groups)}")
     box = _spaces(env)[1]
 
-    class Worlds(Wrapper):
+    class SkrlWorlds(Wrapper):
         """All worlds of an ``Env``."""
 
         def __init__(self) -> None:
@@ -166,4 +166,4 @@ def make_skrl(env: Env, observations: str | None = None, states: str | None = No
         def close(self) -> None:
             """Do nothing."""
 
-    return Worlds()
+    return SkrlWorlds()

@@ -26,7 +26,7 @@ from rsl_rl.runners import OnPolicyRunner
 from ..errors import as_integer
 from ..runtime.arrays import parse_device
 from .environment import Env
-from .training_log import Course, OutOfTime
+from .training_log import TimeLimitReached, TrainingLog
 from .validation import check_folder
 
 
@@ -174,11 +174,11 @@ def make_runner(
     env: Env, learner: Learner, folder: Path | None = None, save_interval: int = 100, every: int = 10,
     began: float | None = None, seconds: float = math.inf,
 ) -> OnPolicyRunner:  # fmt: skip
-    """Return rsl_rl's runner on an environment, with the course of the training in ``folder``."""
+    """Return rsl_rl's runner on an environment, which logs the training in ``folder``."""
     with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints every layer of both networks
         runner = Runner(env, learner.settings(env, save_interval), None, device=str(env.device))
     began = time.time() if began is None else began
-    runner.logger = Course(env, folder, every, began, runner.gpu_global_rank == 0, seconds)  # type: ignore[assignment]
+    runner.logger = TrainingLog(env, folder, every, began, runner.gpu_global_rank == 0, seconds)  # type: ignore[assignment]
     return runner
 
 
@@ -261,7 +261,7 @@ def run(runner: OnPolicyRunner, iterations: int) -> None:
     """Train so many iterations, or until the time is over; then leave a checkpoint."""
     try:
         runner.learn(iterations, init_at_random_ep_len=True)
-    except OutOfTime:
+    except TimeLimitReached:
         runner.save(str(Path(runner.logger.log_dir) / f"model_{runner.current_learning_iteration}.pt"))
 
 

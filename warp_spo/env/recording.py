@@ -20,7 +20,7 @@ STEPS_A_PICTURE = 2  # of a film
 STRIP_SECONDS = 0.08  # between them, so that a strip shows about one stride of a walk
 
 
-class Recording(NamedTuple):
+class Rollout(NamedTuple):
     """States and commands of a world, one row a step of the environment.
 
     Attributes:
@@ -36,7 +36,7 @@ class Recording(NamedTuple):
     device: Any
 
 
-def record(env: Env, policy: Any, seconds: float, command: Any = None, world: int = 0) -> Recording:
+def record(env: Env, policy: Any, seconds: float, command: Any = None, world: int = 0) -> Rollout:
     """Start all worlds anew and return the course of one of them; ``command`` is held if it is given."""
     observed, _ = env.reset()
     env.episode_length_buf = torch.zeros_like(env.episode_length_buf)
@@ -49,7 +49,7 @@ def record(env: Env, policy: Any, seconds: float, command: Any = None, world: in
         for rows, values in zip(states, (env.q, env.qd, env.command if commanded else env.q), strict=True):
             rows.append(values[world].cpu().numpy().copy())
     q, qd, commands = (np.array(rows) for rows in states)
-    return Recording(q, qd, commands if commanded else None, env.step_dt, env.scene.ground, env.warp_device)
+    return Rollout(q, qd, commands if commanded else None, env.step_dt, env.scene.ground, env.warp_device)
 
 
 def play(
@@ -93,25 +93,25 @@ def play(
     ]
 
 
-def markers(task: Any, recorded: Recording, row: int) -> tuple:
+def markers(task: Any, recorded: Rollout, row: int) -> tuple:
     """Return what is drawn beside the robot: the place that a hand is asked to reach."""
     if recorded.commands is None or not hasattr(task, "PLACES"):
         return ()
     return (shapes.Primitive("sphere", -1, (0.025,), (*recorded.commands[row], 0, 0, 0, 1), (0.9, 0.25, 0.05)),)
 
 
-def film(task: Any, recorded: Recording, every: int = 2) -> list:
+def film(task: Any, recorded: Rollout, every: int = 2) -> list:
     """Return pictures of a recording, one of ``every`` steps."""
     return _pictures(task, recorded, range(0, len(recorded.q), every))
 
 
-def strip(task: Any, recorded: Recording, start: float = 0.5) -> list:
+def strip(task: Any, recorded: Rollout, start: float = 0.5) -> list:
     """Return the pictures of a film strip, from a share of the recording on; a stride if it walks."""
     whole = recorded.q.shape[1] == 2 or hasattr(task, "PLACES")
     return _pictures(task, recorded, strip_rows(recorded, whole, start))
 
 
-def strip_rows(recorded: Recording, whole: bool, start: float = 0.5) -> list[int]:
+def strip_rows(recorded: Rollout, whole: bool, start: float = 0.5) -> list[int]:
     """Return the rows of a film strip: over the whole recording, or about a stride from a share of it on."""
     if whole:
         return np.linspace(0, len(recorded.q) - 1, STRIP).astype(int).tolist()
@@ -119,7 +119,7 @@ def strip_rows(recorded: Recording, whole: bool, start: float = 0.5) -> list[int
     return [int(row) for row in rows if row < len(recorded.q)]
 
 
-def _pictures(task: Any, recorded: Recording, rows: Any) -> list:
+def _pictures(task: Any, recorded: Rollout, rows: Any) -> list:
     robot = robots.load(task.ROBOT, recorded.ground)
     rows, places = list(rows), hasattr(task, "PLACES")
     texts = captions(recorded._replace(commands=None) if places else recorded, rows)
@@ -128,7 +128,7 @@ def _pictures(task: Any, recorded: Recording, rows: Any) -> list:
     return _draw(robot.scene, robot.primitives, task.CAMERA, follow, recorded, rows, texts, beside)
 
 
-def captions(recorded: Recording, rows: Sequence[int]) -> list[str]:
+def captions(recorded: Rollout, rows: Sequence[int]) -> list[str]:
     """Return the time of each row, and what is asked for, if anything is."""
     texts = [f"{row * recorded.step:.2f} s" for row in rows]
     if recorded.commands is None:
@@ -138,7 +138,7 @@ def captions(recorded: Recording, rows: Sequence[int]) -> list[str]:
 
 
 def _draw(
-    scene: Scene, drawn: Sequence[shapes.Primitive], camera: films.Camera, follow: bool, recorded: Recording,
+    scene: Scene, drawn: Sequence[shapes.Primitive], camera: films.Camera, follow: bool, recorded: Rollout,
     rows: Sequence[int], texts: list[str], beside: list,
 ) -> list:  # fmt: skip
     """Return a picture of each row; a camera that follows looks from the side of where the robot faces at first."""
@@ -148,7 +148,7 @@ def _draw(
     return films.pictures(scene, drawn, recorded.q[rows], camera, follow, beside, texts, recorded.device)
 
 
-def show(name: str, recorded: Recording, step: float) -> None:
+def show(name: str, recorded: Rollout, step: float) -> None:
     """Play a recording in Newton's viewer, in real time, again and again until its window is closed."""
     import time
 

@@ -1,4 +1,4 @@
-"""The course of a training: printed lines, rows of JSON, and a learning curve."""
+"""The log of a training: printed lines, rows of JSON, and a learning curve."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from .environment import Env
 
 
-class OutOfTime(Exception):
+class TimeLimitReached(Exception):
     """The time that a training may take is over."""
 
 
-class Course:
-    """The course of a training, in place of rsl_rl's logger: a printed line and a row of JSON for an iteration.
+class TrainingLog:
+    """The log of a training, in place of rsl_rl's logger: a printed line and a row of JSON for an iteration.
 
     Means of rewards and of lengths of episodes come from the environment, which gathers them in its graph; an iteration
     reads them once.
@@ -78,7 +78,7 @@ class Course:
                   f"episode {length} s  collecting {1e3 * collect_time:4.0f} ms  "
                   f"learning {1e3 * learn_time:4.0f} ms", flush=True)  # fmt: skip
         if time.time() > self.ends:
-            raise OutOfTime
+            raise TimeLimitReached
 
     def save_model(self, *_: Any) -> None:
         """Do nothing: checkpoints stay in the folder."""

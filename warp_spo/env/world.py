@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..recursions.contact.ground import Place, height
+from ..recursions.contact.ground import GroundOffset, height
 from ..trace import spatial
 from ..trace.functions import AbstractScalar, clip, where
 from ..trace.scalars import floor, lookup
-from .compile.fused_kernel import Stage
+from .compile.fused_kernel import FusedKernel
 from .compile.vectors import Vector, as_scalar, as_value, cross, find, rotate, rotate_back, vector
 from .feet import Feet, feet
 
 if TYPE_CHECKING:
-    from .compile.memory_layout import Layout
+    from .compile.memory_layout import MemoryLayout
 
 
 class Frame(NamedTuple):
@@ -65,7 +65,7 @@ class World:
         before: in resets: the world at the end of the episode; None at the start and in resets on request.
     """
 
-    def __init__(self, layout: Layout, stage: Stage, fresh: Any = None):
+    def __init__(self, layout: MemoryLayout, stage: FusedKernel, fresh: Any = None):
         self._layout, self._stage, self.fresh = layout, stage, fresh
         self.scene = layout.scene
         self.dt = layout.step_dt
@@ -257,7 +257,7 @@ class World:
             raise ValueError("World.ground_height: the scene has no ground; expected scene.with_contacts(..., ground)")
         origin, field = self.value("ground_origin"), self.value("ground_field")
         moved = [as_value(each) for each in origin] if len(origin) else [0.0] * 3
-        place = Place(spatial.Vector(moved), as_value(field[0]) if len(field) else 0.0)
+        place = GroundOffset(spatial.Vector(moved), as_value(field[0]) if len(field) else 0.0)
         stage, ground = self._stage, self.scene.ground
         return AbstractScalar(height(stage.graph, ground, as_value(x), as_value(y), place, together=not stage.rows))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..kernels import straight_line as straight
+from ..kernels import straight_line
 from ..kernels.straight_line import DIRECT, RELAYED, TILED, KernelLayout
 from ..kernels.substeps import SUBSTEPS
 from ..recursions.contact import coupled
@@ -25,7 +25,7 @@ _IS_WORSE = (  # as kernels.combination.worst: a state that an earlier substep l
 
 
 def make_emitter(
-    dtype: str, shapes: dict, layout: KernelLayout, pieces: bool = False, branches: bool = False
+    dtype: str, shapes: dict, layout: KernelLayout, segments: bool = False, branches: bool = False
 ) -> Emitter:
     """Return an emitter of statements for a kernel of this layout.
 
@@ -33,11 +33,11 @@ def make_emitter(
         dtype: "float32" or "float64".
         shapes: of the arrays that the kernel reads and writes, [world, ...], by name.
         layout: how it reads and writes them.
-        pieces: the statements are those of a piece, whose names have a prefix.
+        segments: the statements are those of a segment, whose names have a prefix.
         branches: CUDA branches, too; slower on an H200 but where a branch leaves out much.
     """
     result = layout.result
-    pieces = pieces or layout.warps > 1
+    segments = segments or layout.warps > 1
     angles = RangeReduction.AGAIN if layout.retries else RangeReduction.FIRST
     angles = RangeReduction.IN_PLACE if layout.staged else angles
     guard = "if (mine) " if result.way == DIRECT else ""
@@ -45,7 +45,7 @@ def make_emitter(
     def load(array: str, entry: str) -> str:
         if array in (INWARD, OUTWARD):
             return f"SENT({entry})"
-        if array in (HELD, FORCE, RESISTANCE) or (array in (*LOOPED, SECANT) and pieces):
+        if array in (HELD, FORCE, RESISTANCE) or (array in (*LOOPED, SECANT) and segments):
             return f"{'' if array == MISSED else PREFIX}{array}_row[{entry}]"
         if array == GEOMETRY:
             return f"{GEOMETRY.upper()}({entry})"
@@ -60,12 +60,12 @@ def make_emitter(
             return f"RELAY({entry}) = {value};"
         if array in (HELD, SECANT, FORCE, RESISTANCE, FRAME, *coupled.ARRAYS):
             return f"{load(array, entry)} = {value};"
-        if array == MISSED and pieces:
+        if array == MISSED and segments:
             return f"missed_row[0] += {value};"
-        if array in LOOPED and pieces:
+        if array in LOOPED and segments:
             return f"{'if (open) ' if array == GUESS else ''}{load(array, entry)} = {value};"
         if array == "out" and result.way == TILED:
-            return f"if (mine) result_row[({entry}) * {straight.TILE}] = {value};"
+            return f"if (mine) result_row[({entry}) * {straight_line.TILE}] = {value};"
         if layout.repeats and array == "status":
             return f"if (mine) {{ const int word = {value}; if ({_IS_WORSE}) status_row[0] = word; }}"
         if layout.repeats and array == "contact_f":  # the mean over substeps

@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from ..kernels import coupling, native
-from ..kernels import straight_line as straight
+from ..kernels import coupling, native, straight_line
 from ..kernels.fields import axes
 from ..kernels.native import INTEGERS
 from ..kernels.straight_line import BY_TABLE, TILED, KernelLayout
@@ -89,11 +88,11 @@ class Builder:
         self.run, self.plan, self.dtype = run, plan, run.dtype.__name__
         self.relays = run.device.is_cuda
         self._links: Links | None = None
-        self._walks: bool | None = None
+        self._supports_body_kinematics: bool | None = None
 
     def forget(self) -> None:
         """Drop the links: values that they folded have changed."""
-        self._links = self._walks = None
+        self._links = self._supports_body_kinematics = None
 
     @property
     def links(self) -> Links:
@@ -103,11 +102,11 @@ class Builder:
         return self._links
 
     @property
-    def walks(self) -> bool:
-        """Whether kernels by limbs walk to the bodies of the scene, see :mod:`.walks`."""
-        if self._walks is None:
-            self._walks = body_frames.suits(self.links)
-        return self._walks
+    def supports_body_kinematics(self) -> bool:
+        """Whether a loop over table rows serves the kinematics of the scene's bodies, see :mod:`.body_kinematics`."""
+        if self._supports_body_kinematics is None:
+            self._supports_body_kinematics = body_frames.is_supported(self.links)
+        return self._supports_body_kinematics
 
     def own_links(self, options: dict[str, Any], copies: bool = False) -> Links:
         """Return links of their own for one trace, with what the frames in its options sit on."""
@@ -137,14 +136,14 @@ class Builder:
     def room(self, wide: bool = False, couples: bool = False, whole: bool = False) -> int:
         """Bytes of shared memory that a block may have: for as many scalars in float64 as in float32 if the GPU can.
 
-        ``wide``: for long rows that all go through it. ``couples``: for what limbs couple in it. ``whole``: all that a
-        multiprocessor has.
+        ``wide``: for long rows that all go through it. ``couples``: for what segments couple in it. ``whole``: all that
+        a multiprocessor has.
         """
-        more = straight.COUPLED_BYTES if couples else straight.WIDE_BYTES if wide else 0
-        wanted = max(straight.SHARED_BYTES, more) * wp.types.type_size_in_bytes(self.run.dtype) // 4
+        more = straight_line.COUPLED_BYTES if couples else straight_line.WIDE_BYTES if wide else 0
+        wanted = max(straight_line.SHARED_BYTES, more) * wp.types.type_size_in_bytes(self.run.dtype) // 4
         allowed = self.plan.device.shared_bytes - 3 * RESERVED  # Warp takes a share, too
         wanted = max(wanted, allowed) if whole else wanted
-        return min(wanted, max(allowed, straight.SHARED_BYTES)) if self.plan.device.cuda else wanted
+        return min(wanted, max(allowed, straight_line.SHARED_BYTES)) if self.plan.device.cuda else wanted
 
     def height_tables(self, reads: bool) -> dict[str, Any]:
         """Return the table of the ground's cells, if a program ``reads`` it."""
@@ -176,7 +175,7 @@ class Builder:
             operations: of one world.
             registers: of a thread at most; None: as the compiler chooses.
         """
-        text = straight.assemble(layout, cuda, cpu, self.run.dtype)
+        text = straight_line.assemble(layout, cuda, cpu, self.run.dtype)
         rows, fields = (*(row.name for row in layout.rows), *layout.numbers), tuple(layout.fields)
         arrays = [(row.name, row.ndim) for row in layout.rows] + [(name, 0) for name in layout.numbers]
         arrays += [(name, axes(name)) for name in fields]

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ..kernels import native
-from ..kernels import straight_line as straight
+from ..kernels import native, straight_line
 from ..kernels.fields import place_in_tile
 from ..kernels.long_results import WARP_SIZE
 from ..recursions.model.links import Links
@@ -57,13 +56,15 @@ def _kernel(name: str, values: list, entries: range, T: type) -> tuple[wp.Kernel
     emitter = Emitter(
         "float64",
         lambda array, entry: f"FIELD({array}, {entry})",
-        lambda array, entry, value: f"out.data[{place_in_tile(entry, len(values))}] = ({straight.C_TYPE[T]}){value};",
+        lambda array, entry, value: (
+            f"out.data[{place_in_tile(entry, len(values))}] = ({straight_line.C_TYPE[T]}){value};"
+        ),
         lambda array, index: index[0],
         late=sources,
         fuses=True,
     )
     listing = emitter.region([Store("out", (entry,), values[entry]) for entry in entries])
-    text = straight.assemble_per_world(sources, render(listing, "float64"))
+    text = straight_line.assemble_per_world(sources, render(listing, "float64"))
     arrays = [(source, 2) for source in sources] + [("out", 3)]
     return native.kernel(f"links_{name}", text, arrays, T, wide=tuple(sources)), sources
 
@@ -107,9 +108,9 @@ def _reverse_kernel(stores: list[Store], sources: list[str], size: int, sizes: d
         return f"FIELD({array}, {entry})" if array in sources else f"{array}.data[world * {size} + {entry}]"
 
     def store(array: str, entry: str, value: str) -> str:
-        return f"{array}_bar.data[world * {sizes[array]} + {entry}] = ({straight.C_TYPE[T]})({value});"
+        return f"{array}_bar.data[world * {sizes[array]} + {entry}] = ({straight_line.C_TYPE[T]})({value});"
 
     emitter = Emitter("float64", load, store, lambda array, index: index[0], late=(*sources, "cotangent"), fuses=True)
-    text = straight.assemble_per_world(sources, render(emitter.region(stores), "float64"))
+    text = straight_line.assemble_per_world(sources, render(emitter.region(stores), "float64"))
     arrays = [(source, 2) for source in sources] + [("cotangent", 2)] + [(f"{name}_bar", 2) for name in sizes]
     return native.kernel("links_reverse", text, arrays, T, wide=tuple(sources))

@@ -11,7 +11,7 @@ from ..kernels import native, products
 from ..runtime import launches
 
 
-class Product(NamedTuple):
+class MassInverseProduct(NamedTuple):
     """A kernel that computes q_out, qd_out = -A B for the first two matrices B of a program's result."""
 
     kernel: wp.Kernel
@@ -28,7 +28,7 @@ class Product(NamedTuple):
         launches.launch(self.kernel, threads, inputs, [q_out, qd_out], device=self.device, block_dim=self.block)
 
 
-def build(size: int, places: Sequence[int], slots: int, T: type, device: wp.Device) -> Product:
+def build(size: int, places: Sequence[int], slots: int, T: type, device: wp.Device) -> MassInverseProduct:
     """Return the product for B [matrix, ``size``, ``size``] whose entries have the slots ``places``, -1 being zero."""
     layout = products.choose_layout(size, places, T)
     text = products.assemble(layout, slots, T)
@@ -36,4 +36,4 @@ def build(size: int, places: Sequence[int], slots: int, T: type, device: wp.Devi
     kernel = native.kernel("negative_product", text, arrays, T)
     lists = layout.place_entries(places), layout.order_columns()
     tables: tuple[wp.array, ...] = tuple(wp.array(values, dtype=int, device=device) for values in lists)
-    return Product(kernel, tables, layout.worlds, layout.block, device)
+    return MassInverseProduct(kernel, tables, layout.worlds, layout.block, device)

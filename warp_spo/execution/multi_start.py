@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ..kernels import multi_start as searches
-from ..kernels import native
+from ..kernels import multi_start, native
 from ..kernels.fields import axes
 from ..recursions.model.links import Links
 from ..recursions.model.tracing import Trace
@@ -39,7 +38,7 @@ def build(programs: Programs, routine: Routine, links: Links, given: bool, optio
         for _ in range(2)
     )
     first, again = (render(emitter.region(s), dtype) for emitter, s in ((at_start, start), (at_step, step)))
-    text = searches.assemble_search(fields, first, again, run.scene.coord_count, given, run.dtype)
+    text = multi_start.assemble_search(fields, first, again, run.scene.coord_count, given, run.dtype)
     rows = ROWS if given else ROWS[:-1]
     arrays = [("weight", 0), ("iterations", 0), ("target", 3), ("share", 2), ("given", 2)][: 2 + len(rows)]
     arrays += [(name, axes(name)) for name in fields] + [("found", 2), ("errors", 1)]
@@ -83,4 +82,4 @@ def launch(
     inputs += [programs.field(name) for name in program.fields]
     flat = [found.reshape((found.shape[0], threads)), errors.reshape((threads,))]
     launches.launch(program.kernel, threads, inputs, flat, device=run.device, block_dim=program.block)
-    run.launch(searches.select_best, run.worlds, [errors, found], [q_out, error_out])
+    run.launch(multi_start.select_best, run.worlds, [errors, found], [q_out, error_out])

@@ -8,10 +8,10 @@ import itertools
 from ..errors import UnsupportedError
 from ..kernels.long_results import WARP_SIZE
 from ..recursions.model.links import Links
-from ..recursions.model.segments import PARTS, Pieces
+from ..recursions.model.segments import PARTS, Segments
 from ..scene.scene import Scene
 from .device_facts import RESERVED, DeviceFacts
-from .node.path_blocks import cut, solid_nodes
+from .node.path_blocks import decompose, solid_nodes
 from .routine import Routine
 from .tuned import Tuned
 
@@ -24,11 +24,16 @@ COLUMN_BYTES = 1 << 28  # workspace of a solve with many right-hand sides; more 
 # Measured on an H200, 2026-11-21; see CONTRIBUTING. Numbers of worlds and of threads are in proportion to its
 # multiprocessors on another GPU, see DeviceFacts.scaled.
 FEW_WORLDS = 32768  # so many leave a GPU waiting: a warp for each limb, and rows read where they are
-ALIKE_WORLDS = 40960  # up to so many, a warp for each limb is faster if limbs share code (Go2 on 58 multiprocessors)
+SHARED_CODE_WORLDS = (
+    40960  # up to so many, a warp for each limb is faster if limbs share code (Go2 on 58 multiprocessors)
+)
 MOST_DOFS = 128  # straight-line code of more takes too long to compile
 SPILLS = {"float32": 32, "float64": 15}  # dofs at which one thread no longer holds a whole tree in registers,
 SOLVES = {"float32": 32, "float64": 20}  # and at which it does not without velocities
-ALIKE = {"float32": 0.5, "float64": 0.0}  # share of limbs that share code; below it a thread a world is faster then
+LEAST_SHARED_CODE = {
+    "float32": 0.5,
+    "float64": 0.0,
+}  # share of limbs that share code; below it a thread a world is faster then
 SERIAL = (
     0.75  # share of the links on one path from a root, beyond which limbs save less than they cost: an arm's fingers
 )
@@ -41,17 +46,17 @@ NODE_WORLDS = 1024  # of a CPU, beyond which a launch for each level only takes 
 DEEPEST = 12  # dofs from a root to a leaf, a free hinge one, up to which velocity terms that come first are as accurate
 VELOCITIES_FIRST = {"tree": {"float32": HELD, "float64": HELD}, "segment": SPILLS}  # dofs beyond which they are faster
 AT_ONCE = 65536  # worlds that a GPU runs at once, a thread each with up to 128 registers
-PLACES = 28  # least number of places for values that are set aside; fewer do not save as many registers
+LEAST_SPILL_SLOTS = 28  # least number of places for values that are set aside; fewer do not save as many registers
 
 # Measured on an H200, 2026-11-22, see benchmarks/depth.py. In a graph, a launch of a sweep takes 3.4 us and one of a
 # scan 5 to 7 us, because a round of a scan is a product of two elements. A scan does three to five times the work of a
 # sweep, so it pays while threads wait; with more worlds a thread takes more nodes.
-STRETCH = 4  # nodes that a thread of a scan works through where few threads run; 8 are as fast, 2 and 16 slower
-STRETCHES = (4, 16, 64)  # that are timed where plans are measured
+BLOCK_LENGTH = 4  # nodes that a thread of a scan works through where few threads run; 8 are as fast, 2 and 16 slower
+BLOCK_LENGTHS = (4, 16, 64)  # that are timed where plans are measured
 SCAN_LAUNCH = 3  # launches of sweeps that take the time of one launch of a scan
 SWEEPS = 4  # of forward dynamics: motion outward, factors and forces inward, accelerations outward
-SCAN_THREADS = 32768  # stretches times worlds that keep a GPU busy; with more a scan only does more work
-# Measured on a CPU, 2026-11-22: whole paths as stretches take 0.1 ms for 256 bodies in one world, sweeps 8 ms, nearly
+SCAN_THREADS = 32768  # path blocks times worlds that keep a GPU busy; with more a scan only does more work
+# Measured on a CPU, 2026-11-22: whole paths as blocks take 0.1 ms for 256 bodies in one world, sweeps 8 ms, nearly
 # all of it launches; at 16 worlds 1.3 against 6, and at 128 worlds 30 against 17.
 CPU_WORLDS = 32
 
@@ -71,15 +76,16 @@ class Plan:
         device: what it is that runs them.
         dtype: "float32" or "float64".
         dofs: of the scene.
-        limbs: serial chains that end in a leaf; counted where it matters. alike: enough of them share code.
-        apart: forward dynamics takes velocity terms and loads first, and keeps no link's velocity for the rest. It does
-            not depend on the number of worlds, because the results have other bits.
-        varies: inertias or hinge frames come from memory.
-        stretch: at node granularity, scans do the work of most sweeps, with so many nodes for a thread, see
+        leaf_segments: serial chains that end in a leaf; counted where it matters. segments_share_code: enough of them
+            share code.
+        bias_first: forward dynamics takes velocity terms and loads first, and keeps no link's velocity for the rest. It
+            does not depend on the number of worlds, because the results have other bits.
+        variable_inertia: inertias or hinge frames come from memory.
+        block_length: at node granularity, scans do the work of most sweeps, with so many nodes for a thread, see
             :mod:`.scan`; 0: sweeps do.
         scan_reason: why.
         tuned: choices that were measured, by the routine's name; they replace the rules.
-        instead: the plans by which the routines run whose choice is another granularity than that of the rules.
+        tuned_plans: the plans by which the routines run whose choice is another granularity than that of the rules.
     """
 
     granularity: str
@@ -91,17 +97,17 @@ class Plan:
     device: DeviceFacts
     dtype: str
     dofs: int
-    limbs: int = 1
-    alike: bool = True
-    apart: bool = False
-    varies: bool = False
-    stretch: int = 0
+    leaf_segments: int = 1
+    segments_share_code: bool = True
+    bias_first: bool = False
+    variable_inertia: bool = False
+    block_length: int = 0
     scan_reason: str = ""
     tuned: dict[str, Tuned] = dataclasses.field(default_factory=dict)
-    instead: dict[str, Plan] = dataclasses.field(default_factory=dict)
+    tuned_plans: dict[str, Plan] = dataclasses.field(default_factory=dict)
 
     @property
-    def few(self) -> bool:
+    def latency_bound(self) -> bool:
         """So few worlds that a GPU waits for latency, not for instructions."""
         return self.worlds <= self.device.scaled(FEW_WORLDS)
 
@@ -112,8 +118,8 @@ class Plan:
 
     def of(self, routine: Routine) -> str:
         """Return the granularity of one routine: the plan's own where the routine has that form."""
-        if routine.name in self.instead:
-            return self.instead[routine.name].of(routine)
+        if routine.name in self.tuned_plans:
+            return self.tuned_plans[routine.name].of(routine)
         if not routine.has_segment_form and not routine.has_node_form:
             return "tree"
         chosen = self.granularity if self.forced else self._rule(routine)
@@ -122,50 +128,54 @@ class Plan:
         return chosen if routine.has_node_form else "tree"
 
     def _rule(self, routine: Routine) -> str:
-        if self.granularity == "node" or self.limbs == 1 or self.limbs > MOST_WARPS:
+        if self.granularity == "node" or self.leaf_segments == 1 or self.leaf_segments > MOST_WARPS:
             return self.granularity
         if routine.couples:
-            few = self.alike and self.worlds <= self.device.scaled(ALIKE_WORLDS)
+            few = self.segments_share_code and self.worlds <= self.device.scaled(SHARED_CODE_WORLDS)
             return "segment" if few else "tree"
-        if routine.counted and not self.alike and self.dofs <= HELD:
+        if routine.counted and not self.segments_share_code and self.dofs <= HELD:
             return "tree"
         if routine.long_result or routine.passes or routine.crowded:  # a thread holds too little even of a dozen dofs
             return "segment"
-        if self.granularity == "segment" and not self.few:
+        if self.granularity == "segment" and not self.latency_bound:
             if routine.short or (not routine.velocities and self.dofs <= SOLVES[self.dtype]):
                 return "tree"
         return self.granularity
 
     def at(self, routine: Routine) -> Plan:
         """Return the plan by which a routine runs."""
-        return self.instead.get(routine.name, self)
+        return self.tuned_plans.get(routine.name, self)
 
     def candidates(self, routine: Routine) -> tuple[str, ...]:
         """Return the granularities at which a routine may run here, those of the rules first."""
         first = self.of(routine)
         if self.forced or self.dofs > MOST_DOFS or not self.dofs:
             return (first,)
-        divides = self.device.cuda and routine.has_segment_form and 1 < self.limbs <= MOST_WARPS
+        divides = self.device.cuda and routine.has_segment_form and 1 < self.leaf_segments <= MOST_WARPS
         sweeps = routine.has_node_form and not self.device.cuda and self.worlds <= NODE_WORLDS
         found = ["tree", *["segment"] * divides, *["node"] * sweeps]
         return (first, *(name for name in found if name != first))
 
-    def stretches(self, scene: Scene) -> dict[str, int]:
-        """Return the stretches with which the sweeps of a scene may run here, by name, that of the rules first.
+    def block_lengths(self, scene: Scene) -> dict[str, int]:
+        """Return the block lengths with which the sweeps of a scene may run here, by name, that of the rules first.
 
         0, named "sweep", is without scans. Of lengths that cut the tree alike the first counts.
         """
         if self.forced or self.scan_reason == ASKED or self.granularity != "node" or not self.dofs:
-            return {name_stretch(self.stretch): self.stretch}
-        lengths = STRETCHES if self.device.cuda else (scene.body_count, *STRETCHES)
-        solid, cuts, found = solid_nodes(scene), [], [self.stretch, 0]
-        for length in dict.fromkeys((self.stretch, *lengths)):
-            pieces = cut(scene.tree, solid, length) if length else None
-            if pieces is None or pieces.nodes in cuts or (self.varies and any(x.longest > 1 for x in pieces.levels)):
+            return {name_block_length(self.block_length): self.block_length}
+        lengths = BLOCK_LENGTHS if self.device.cuda else (scene.body_count, *BLOCK_LENGTHS)
+        solid, known, found = solid_nodes(scene), [], [self.block_length, 0]
+        for length in dict.fromkeys((self.block_length, *lengths)):
+            blocks = decompose(scene.tree, solid, length) if length else None
+            if (
+                blocks is None
+                or blocks.nodes in known
+                or (self.variable_inertia and any(x.longest > 1 for x in blocks.levels))
+            ):
                 continue
-            cuts.append(pieces.nodes)
+            known.append(blocks.nodes)
             found.append(length)
-        return {name_stretch(length): length for length in dict.fromkeys(found)}
+        return {name_block_length(length): length for length in dict.fromkeys(found)}
 
     def stages(self, routine: Routine, warps: int) -> bool:
         """Whether rows come in through shared memory, for kernels in which ``warps`` share 32 worlds."""
@@ -178,7 +188,12 @@ class Plan:
         They come sooner, but the compiler then takes more registers; that costs nothing where all worlds run at once.
         """
         suits = routine.short or routine.waits_late
-        return suits and not self.varies and not self.few and self.worlds <= self.device.scaled(AT_ONCE)
+        return (
+            suits
+            and not self.variable_inertia
+            and not self.latency_bound
+            and self.worlds <= self.device.scaled(AT_ONCE)
+        )
 
     def gathers(self, routine: Routine, warps: int, results: int) -> bool:
         """Whether short results leave through shared memory though rows do not come in through it.
@@ -187,24 +202,30 @@ class Plan:
         """
         if warps > 1:
             return self.worlds > WARP_SIZE if self.dofs > LONG_ROWS else routine.collects
-        return results > FEW_RESULTS or (not self.few and (self.varies or routine.short))
+        return results > FEW_RESULTS or (not self.latency_bound and (self.variable_inertia or routine.short))
 
-    def places_aside(self, routine: Routine, shared_bytes: int, bytes_of: int, warps: int) -> int:
+    def spill_slots(self, routine: Routine, shared_bytes: int, bytes_of: int, warps: int) -> int:
         """Return how many values each thread of a team sets aside in shared memory, to need fewer registers; 0: none.
 
-        As many as leave room for all the blocks that ``routine.aside`` registers allow. Measured on an H200,
-        2026-11-23: G1 with variable inertias takes 841 us for 919 at 2^20 worlds. With folded ones, and with a thread
-        a world, the spills that they replace, or more registers, take less time.
+        As many as leave room for all the blocks that ``routine.registers_when_spilling`` registers allow. Measured on
+        an H200, 2026-11-23: G1 with variable inertias takes 841 us for 919 at 2^20 worlds. With folded ones, and with a
+        thread a world, the spills that they replace, or more registers, take less time.
 
         Args:
             shared_bytes: of the block without these values. bytes_of: of a value. warps: of the team.
         """
-        if not routine.aside or not self.varies or self.few or bytes_of > 4 or self.dofs <= SPILLS["float32"]:
+        if (
+            not routine.registers_when_spilling
+            or not self.variable_inertia
+            or self.latency_bound
+            or bytes_of > 4
+            or self.dofs <= SPILLS["float32"]
+        ):
             return 0
-        blocks = PARTS * (self.device.registers // PARTS // (WARP_SIZE * routine.aside)) // warps
+        blocks = PARTS * (self.device.registers // PARTS // (WARP_SIZE * routine.registers_when_spilling)) // warps
         room = self.device.shared_bytes // max(blocks, 1) - 3 * RESERVED - shared_bytes  # Warp takes a share, too
         places = room // (WARP_SIZE * warps * bytes_of)
-        return places if places >= PLACES else 0
+        return places if places >= LEAST_SPILL_SLOTS else 0
 
     def fuses_substeps(self, granularity: str) -> bool:
         """Whether one kernel takes all substeps faster than a launch each.
@@ -220,7 +241,7 @@ class Plan:
 
         Sweeps do not, because they share a workspace. With many worlds each kernel fills the GPU by itself.
         """
-        return self.device.cuda and self.few and self.of(routine) != "node"
+        return self.device.cuda and self.latency_bound and self.of(routine) != "node"
 
     def column_chunk(self, columns: int, bytes_per_column: int) -> int:
         """Right-hand sides that go through a solve at once."""
@@ -233,12 +254,12 @@ def choose(
     device: DeviceFacts,
     dtype: str,
     granularity: str | None = None,
-    varies: bool = False,
+    variable_inertia: bool = False,
     recursion: str | None = None,
 ) -> Plan:
     """Return the plan for a scene and a world count on a device; ``granularity`` and ``recursion`` force one.
 
-    ``varies``: inertias or hinge frames are inputs, which a thread has to hold too.
+    ``variable_inertia``: inertias or hinge frames are inputs, which a thread has to hold too.
 
     Raises:
         ValueError: no such granularity or recursion, or a scan at another granularity than "node".
@@ -247,10 +268,14 @@ def choose(
     shared = scene.shares_dofs
     asked = "tree" if shared else granularity or ("node" if recursion == "scan" else DEFAULT)
     side_by_side = device.cuda and not shared and asked != "node" and 0 < scene.dof_count <= MOST_DOFS
-    pieces = Pieces(Links(scene)) if side_by_side else None
-    limbs, alike = (pieces.warps, pieces.alike >= ALIKE[dtype]) if pieces else (1, True)
-    serial = pieces is not None and pieces.serial >= SERIAL
-    rule = _choose_by_rule(scene.dof_count, limbs, alike, serial, worlds, device, dtype, varies)
+    segments = Segments(Links(scene)) if side_by_side else None
+    leaf_segments, segments_share_code = (
+        (segments.warps, segments.shared_code_fraction >= LEAST_SHARED_CODE[dtype]) if segments else (1, True)
+    )
+    serial = segments is not None and segments.longest_path_fraction >= SERIAL
+    rule = _choose_by_rule(
+        scene.dof_count, leaf_segments, segments_share_code, serial, worlds, device, dtype, variable_inertia
+    )
     chosen, reason = (asked, ASKED) if asked else rule
     if shared:
         reason = SHARED
@@ -258,13 +283,19 @@ def choose(
     staged = scene.dof_count > rows and worlds > device.scaled(
         FEW_WORLDS if scene.dof_count <= LONG_ROWS else FEW_WORLDS // 16
     )
-    apart = side_by_side and not varies and _takes_velocities_first(scene, "tree" if limbs == 1 else chosen, dtype)
+    bias_first = (
+        side_by_side
+        and not variable_inertia
+        and _takes_velocities_first(scene, "tree" if leaf_segments == 1 else chosen, dtype)
+    )
     if recursion is not None:
-        stretch = STRETCH if recursion == "scan" else 0, ASKED
+        block_length = BLOCK_LENGTH if recursion == "scan" else 0, ASKED
     elif chosen != "node" or not scene.dof_count:
-        stretch = 0, ""
+        block_length = 0, ""
     else:
-        stretch = (0, "granularity is asked for") if asked else _stretch(scene, worlds, device, varies)
+        block_length = (
+            (0, "granularity is asked for") if asked else _choose_block_length(scene, worlds, device, variable_inertia)
+        )
     sizes = [len(level) for level in scene.tree.levels]
     levels = tuple(zip(itertools.accumulate(sizes, initial=0), sizes, strict=False))
     return Plan(
@@ -277,11 +308,11 @@ def choose(
         device,
         dtype,
         scene.dof_count,
-        limbs,
-        alike,
-        apart,
-        varies,
-        *stretch,
+        leaf_segments,
+        segments_share_code,
+        bias_first,
+        variable_inertia,
+        *block_length,
     )
 
 
@@ -301,26 +332,26 @@ def _check_options(scene: Scene, granularity: str | None, recursion: str | None)
         raise UnsupportedError("Dynamics", what, way if granularity else "leave recursion out")
 
 
-def _stretch(scene: Scene, worlds: int, device: DeviceFacts, varies: bool) -> tuple[int, str]:
+def _choose_block_length(scene: Scene, worlds: int, device: DeviceFacts, variable_inertia: bool) -> tuple[int, str]:
     """Return how many nodes a thread of a scan takes, 0 if sweeps take less time than scans, and why."""
-    solid, length = solid_nodes(scene), STRETCH if device.cuda else scene.body_count
-    pieces = cut(scene.tree, solid, length)
-    while device.cuda and length < scene.body_count and worlds * len(pieces.nodes) > device.scaled(SCAN_THREADS):
+    solid, length = solid_nodes(scene), BLOCK_LENGTH if device.cuda else scene.body_count
+    blocks = decompose(scene.tree, solid, length)
+    while device.cuda and length < scene.body_count and worlds * len(blocks.nodes) > device.scaled(SCAN_THREADS):
         length *= 2
-        pieces = cut(scene.tree, solid, length)
-    scans, sweeps = pieces.launches, SWEEPS * len(scene.tree.levels)
+        blocks = decompose(scene.tree, solid, length)
+    scans, sweeps = blocks.launches, SWEEPS * len(scene.tree.levels)
     counts = f"{scans} launches in a row against {sweeps} of sweeps"
     if SCAN_LAUNCH * scans >= sweeps:
         return 0, f"scans would be {counts}"
-    if varies and any(level.longest > 1 for level in pieces.levels):
+    if variable_inertia and any(level.longest > 1 for level in blocks.levels):
         return 0, "scans begin at bodies that have inertia, which variable values may take away"
-    threads, most = (len(pieces.nodes), device.scaled(SCAN_THREADS)) if device.cuda else (1, CPU_WORLDS)
+    threads, most = (len(blocks.nodes), device.scaled(SCAN_THREADS)) if device.cuda else (1, CPU_WORLDS)
     if worlds * threads > most:
         return 0, f"with {worlds} worlds the work takes longer than launches; scans would be {counts}"
     return length, f"{counts}, a thread takes up to {length} nodes"
 
 
-def name_stretch(length: int) -> str:
+def name_block_length(length: int) -> str:
     """Return the name of sweeps without scans, or of scans with so many nodes for a thread."""
     return f"scan of {length}" if length else "sweep"
 
@@ -341,27 +372,34 @@ def _depth(scene: Scene) -> int:
 
 
 def _choose_by_rule(
-    dofs: int, limbs: int, alike: bool, serial: bool, worlds: int, device: DeviceFacts, dtype: str, varies: bool
+    dofs: int,
+    leaf_segments: int,
+    segments_share_code: bool,
+    serial: bool,
+    worlds: int,
+    device: DeviceFacts,
+    dtype: str,
+    variable_inertia: bool,
 ) -> tuple[str, str]:
-    held = min(HELD, SPILLS[dtype]) if varies else SPILLS[dtype]
-    few_worlds = device.scaled(ALIKE_WORLDS if alike else FEW_WORLDS)
+    held = min(HELD, SPILLS[dtype]) if variable_inertia else SPILLS[dtype]
+    few_worlds = device.scaled(SHARED_CODE_WORLDS if segments_share_code else FEW_WORLDS)
     if dofs == 0:
         return "node", "nothing moves"
     if dofs > MOST_DOFS:
         return "node", f"more than {MOST_DOFS} dof take long to compile as straight-line code"
     if not device.cuda:
         return "tree", "one thread works through a world"
-    if limbs == 1:
+    if leaf_segments == 1:
         return "tree", "the scene is one chain"
-    if limbs > MOST_WARPS:
+    if leaf_segments > MOST_WARPS:
         return "tree", f"more than {MOST_WARPS} limbs"
     if serial and dofs <= held:
         return "tree", "most of its links are on one path, so that limbs side by side save no time"
     if worlds <= few_worlds:
-        return "segment", f"up to {few_worlds} worlds, {limbs} limbs side by side take less time"
+        return "segment", f"up to {few_worlds} worlds, {leaf_segments} limbs side by side take less time"
     if dofs > held:
-        if not alike:
-            return "tree", f"{limbs} limbs with code of their own each do not fit into the instruction cache"
+        if not segments_share_code:
+            return "tree", f"{leaf_segments} limbs with code of their own each do not fit into the instruction cache"
         return "segment", f"{dofs} dof in {dtype} do not fit into one thread's registers"
     return "tree", f"more than {few_worlds} worlds keep the GPU busy with a thread each"
 
@@ -369,15 +407,15 @@ def _choose_by_rule(
 def describe(plan: Plan) -> str:
     """Return one line: the granularity, the reason for it, and the other granularities."""
     others = ", ".join(name for name in GRANULARITIES if name != plan.granularity)
-    limbs = plan.limbs if plan.granularity == "segment" else 1
-    staged = plan.staged and (limbs == 1 or plan.worlds > plan.device.scaled(FEW_WORLDS // 4))
+    leaf_segments = plan.leaf_segments if plan.granularity == "segment" else 1
+    staged = plan.staged and (leaf_segments == 1 or plan.worlds > plan.device.scaled(FEW_WORLDS // 4))
     rows = "through shared memory" if staged else "by each thread for itself"
-    first = "forward dynamics takes velocity terms first; " if plan.apart else ""
+    first = "forward dynamics takes velocity terms first; " if plan.bias_first else ""
     force = "no other granularity serves them" if plan.reason == SHARED else f"granularity= can force {others}"
     return f"{plan.granularity}: {plan.reason}; rows are read {rows}; {first}{force}"
 
 
 def describe_recursion(plan: Plan) -> str:
     """Return one line: whether node granularity sweeps or scans, and the reason for it."""
-    chosen, other = RECURSIONS[::-1] if plan.stretch else RECURSIONS
+    chosen, other = RECURSIONS[::-1] if plan.block_length else RECURSIONS
     return f"{chosen}: {plan.scan_reason}; recursion= can force {other}"

@@ -9,16 +9,14 @@ import warp as wp
 from ..kernels.substeps import SUBSTEPS
 from ..recursions.contact import coupled
 from ..recursions.model.links import TABLES, Links
-from ..recursions.model.segments import Pieces
+from ..recursions.model.segments import Segments
 from ..runtime import launches
-from . import link_values, tree_programs
-from . import mass_inverse_products as products
-from . import multi_start as searches
+from . import link_values, mass_inverse_products, multi_start, tree_programs
 from .builder import Builder, Job, Program
 from .node.sweeps import Sweeps
 from .plan import MOST_WARPS, Plan
 from .routine import Routine
-from .segment import body_kinematics as walks
+from .segment import body_kinematics
 from .segment import programs as segment_programs
 from .segment.programs import BODIES
 
@@ -37,7 +35,7 @@ class Programs:
     def __init__(self, run: Sweeps, plan: Plan):
         self.run, self.builder = run, Builder(run, plan)
         self._programs: dict[tuple, Program | None] = {}
-        self._products: dict[tuple[int, ...], products.Product] = {}
+        self._products: dict[tuple[int, ...], mass_inverse_products.MassInverseProduct] = {}
 
     def forget(self) -> None:
         """Drop all programs: values that they folded have changed."""
@@ -93,10 +91,10 @@ class Programs:
             program.kernel, threads, [worlds, *inputs], [out, *more], device=self.run.device, block_dim=block
         )
 
-    def product(self, program: Program, size: int) -> products.Product:
+    def product(self, program: Program, size: int) -> mass_inverse_products.MassInverseProduct:
         """Return the kernel of -A B for the first two matrices [``size``, ``size``] of a program's result in tiles."""
         if program.places not in self._products:
-            found = products.build(size, program.places, program.slots, self.run.dtype, self.run.device)
+            found = mass_inverse_products.build(size, program.places, program.slots, self.run.dtype, self.run.device)
             self._products[program.places] = found
         return self._products[program.places]
 
@@ -140,21 +138,21 @@ class Programs:
         if not links.links or not routine.suits(links, inputs, **options):
             return None
         if routine.start is not None:
-            return searches.build(self, routine, links, "given" in inputs, options)
+            return multi_start.build(self, routine, links, "given" in inputs, options)
         divides = routine.divides(self.run.scene, inputs, **options)
         shared = self.plan.of(routine) == "segment" and divides
-        if shared and routine.walks and self.builder.walks:
-            return walks.build(self.builder, job, links)
-        if routine.bias_first is not None and self.plan.at(routine).apart and "qd" in inputs:
+        if shared and routine.body_kinematics and self.builder.supports_body_kinematics:
+            return body_kinematics.build(self.builder, job, links)
+        if routine.bias_first is not None and self.plan.at(routine).bias_first and "qd" in inputs:
             job = job._replace(routine=routine.bias_first)
         ways = [dict(alone=False)] if shared else []
         if routine.couples and divides and not coupled.suits(links):
             ways += [dict(alone=True), dict(alone=True, local=True)]
-        pieces = Pieces(links) if ways else None
+        segments = Segments(links) if ways else None
         for way in ways:
-            assert pieces is not None
-            if 1 < pieces.warps <= MOST_WARPS or way["alone"]:
-                program = segment_programs.build(self.builder, job, pieces, **way)
+            assert segments is not None
+            if 1 < segments.warps <= MOST_WARPS or way["alone"]:
+                program = segment_programs.build(self.builder, job, segments, **way)
                 if program is not None:
                     return program
         return None if options.get(BODIES) else tree_programs.build(self.builder, job, links)

@@ -26,32 +26,34 @@ class Routine:
         sweeps: ``sweeps(run, out, **arrays)`` launches the same computation at node granularity; None: there is only
             the traced kernel of the scene.
         blocks: at node granularity the caller applies stored blocks instead of this routine.
-        letters: messages that limbs send each other, see :mod:`warp_spo.recursions.model.messages`. "": they send none.
-        alone: limbs share the work without messages. Where they do not, and without letters, one thread works on a
+        letters: messages that segments send each other, see :mod:`warp_spo.recursions.model.messages`. "": they send
+            none.
+        alone: segments share the work without messages. Where they do not, and without letters, one thread works on a
             whole world.
-        divides: ``divides(scene, inputs, **options)``, whether limbs can share the work for these inputs and options.
+        divides: ``divides(scene, inputs, **options)``, whether segments can share the work for these inputs and
+            options.
         suits: ``suits(links, shapes, **options)``, whether the traced kernel serves this scene; if not, the sweeps do.
         short: the code is short, so that one thread holds a large tree without spilling registers.
         velocities: the velocities of links are kept during the recursion, which takes registers.
         long_result: writing the result is most of the work, and many warps write faster.
-        collects: by limbs, short rows of the result leave through shared memory.
+        collects: by segments, short rows of the result leave through shared memory.
         passes: the recursion is repeated until the laws of the joints hold, and its results may overwrite its inputs.
         counted: so often as the argument "passes" says.
-        crowded: a thread holds too little even of a dozen dofs, so that limbs share the work with many worlds, too.
-        couples: by limbs, native code couples pairs of bodies between their sweeps.
+        crowded: a thread holds too little even of a dozen dofs, so that segments share the work with many worlds, too.
+        couples: by segments, native code couples pairs of bodies between their sweeps.
         tiled: the result is left in tiles for the kernels of :mod:`warp_spo.kernels.tiles` to finish.
         bias_first: variant that computes velocity terms and loads first, for many worlds of shallow trees.
-        occupancy: pairs (blocks, registers): by limbs in float32 with many worlds, a multiprocessor holds so many
+        occupancy: pairs (blocks, registers): by segments in float32 with many worlds, a multiprocessor holds so many
             blocks if a thread then still has so many registers; the first pair that applies.
         waits_late: with a thread a world, where all worlds run at once, a block has two warps, and they wait for a row
             where they first use it.
-        aside: by limbs, with many worlds and variable inertias, registers of a thread that sets aside in shared memory
-            what nothing uses for long, see :mod:`..trace.set_aside`; 0: it sets nothing aside.
+        registers_when_spilling: by segments, with many worlds and variable inertias, registers of a thread that keeps
+            values in shared memory while nothing uses them, see :mod:`..trace.register_spilling`; 0: it keeps none.
         variants: at most so many different options get a kernel of their own where sweeps serve the others.
         wide: its rows are long, so that a team asks for as much shared memory as they need.
         start: ``start(trace, **options)`` returns what a search starts from; None: the kernel is no search, see
             :mod:`.searches`.
-        walks: where bodies are walked to, by limbs, see :mod:`.walks`.
+        body_kinematics: by segments, one loop over table rows serves bodies, see :mod:`.segment.body_kinematics`.
         title: ``title(inputs, **options)``, what a user calls this computation; None: the name.
     """
 
@@ -75,16 +77,16 @@ class Routine:
     bias_first: Routine | None = None
     occupancy: tuple[tuple[int, int], ...] = ()
     waits_late: bool = False
-    aside: int = 0
+    registers_when_spilling: int = 0
     variants: int = VARIANTS
     wide: bool = False
     start: Callable[..., list[Store]] | None = None
-    walks: bool = False
+    body_kinematics: bool = False
     title: Callable[..., str] | None = None
 
     @property
     def has_segment_form(self) -> bool:
-        """Whether limbs can share the work."""
+        """Whether segments can share the work."""
         return bool(self.letters) or self.alone
 
     @functools.cached_property

@@ -9,8 +9,18 @@ import math
 from collections.abc import Hashable, Mapping, Sequence
 
 from ..kernels.long_results import WARP_SIZE
-from ..kernels.shared_rows import Row
-from ..kernels.straight_line import BY_TABLE, DIRECT, IN_PLACE, MAPPED, RELAYED, STAGED, TILED, KernelLayout, Result
+from ..kernels.shared_rows import SharedRow
+from ..kernels.straight_line import (
+    BY_TABLE,
+    DIRECT,
+    IN_PLACE,
+    MAPPED,
+    RELAYED,
+    STAGED,
+    TILED,
+    KernelLayout,
+    ResultLayout,
+)
 from ..kernels.substeps import SUBSTEPS
 from ..recursions.model.links import TABLES
 from ..scene.actuators import ACTUATOR_VALUES
@@ -58,30 +68,32 @@ def choose_layout(
         wide: there is room for long results as they are, without a table of their distinct values.
     """
     used = read_entries(everything)
-    rows = [Row(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used and shape]
+    rows = [
+        SharedRow(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used and shape
+    ]
     numbers = tuple(name for name, shape in shapes.items() if (name in used or name == SUBSTEPS) and not shape)
-    out = Row("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
+    out = SharedRow("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
     dense = sorted(item.index[0] for item in stores) == list(range(out.entries))
     over = _rows_to_write_over(rows, out, stores, everything, ("qd",) if warps > 1 and "ctrl" in used else ())
     slots = count_slots(stores)
     fields = {name: tuple(sorted(used[name])) for name in FIELDS if name in used}
     cached = ((), tuple(fields.values())) if fields and warps == 1 else ((),)
-    ways = [(False, Result(DIRECT, out))]
+    ways = [(False, ResultLayout(DIRECT, out))]
     staged = staged or any(row.name in ("x", "body_f") and row.entries > SHORT_ROW for row in rows)
     if dense and (staged or gathered or out.entries > SHORT_ROW):
-        ways = [(staged, Result(STAGED, out)), (False, Result(STAGED, out)), *ways]
+        ways = [(staged, ResultLayout(STAGED, out)), (False, ResultLayout(STAGED, out)), *ways]
     if dense and staged:
-        ways = [*((True, Result(IN_PLACE, out, name)) for name in over[-1:]), *ways]
+        ways = [*((True, ResultLayout(IN_PLACE, out, name)) for name in over[-1:]), *ways]
     if out.entries > LONG_ROW and not (wide and dense) and not (dense and staged and over == ["x"]):
-        mapped = Result(MAPPED, out, slots=slots)
+        mapped = ResultLayout(MAPPED, out, slots=slots)
         ways = [(staged, mapped), (False, mapped), *ways]
         if relays and _may_write_early(rows, out):
-            ways.insert(-1, (False, Result(RELAYED, out, slots=slots)))
+            ways.insert(-1, (False, ResultLayout(RELAYED, out, slots=slots)))
     if SUBSTEPS in shapes:
-        ways = [(way, Result(IN_PLACE, out, "qd")) for way in sorted({staged, False}, reverse=True)]
+        ways = [(way, ResultLayout(IN_PLACE, out, "qd")) for way in sorted({staged, False}, reverse=True)]
     if tiled:
-        ways = [(way, Result(TILED, out, slots=slots)) for way in sorted({staged, False}, reverse=True)]
-    other_results = tuple(Row(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in further)
+        ways = [(way, ResultLayout(TILED, out, slots=slots)) for way in sorted({staged, False}, reverse=True)]
+    other_results = tuple(SharedRow(name, len(shapes[name]), math.prod(shapes[name][1:])) for name in further)
     layouts = [
         KernelLayout(
             rows=rows,
@@ -105,18 +117,18 @@ def choose_layout(
 
 
 def _rows_to_write_over(
-    rows: list[Row], out: Row, stores: list[Store], everything: list[Store], late: Sequence[str]
+    rows: list[SharedRow], out: SharedRow, stores: list[Store], everything: list[Store], late: Sequence[str]
 ) -> list[str]:
     """Return the names of rows as long as the result's of which each entry is read before the result's is written.
 
-    ``late``: rows of which a piece may read an entry after another piece has written it; others are always such.
+    ``late``: rows of which a segment may read an entry after another segment has written it; others are always such.
     """
     late = (*late, "q", "body_f", "ctrl")
     long_enough = [row.name for row in rows if row.entries == out.entries and row.name not in late]
     return [name for name in long_enough if is_read_before_written(stores, everything, name)]
 
 
-def _may_write_early(rows: list[Row], out: Row) -> bool:
+def _may_write_early(rows: list[SharedRow], out: SharedRow) -> bool:
     """Return whether the kernel may write the result before it has read everything.
 
     It may not where an argument can be the array of the result, which has the same number of entries then.
@@ -132,7 +144,7 @@ def is_read_before_written(stores: list[Store], everything: list[Store], row: st
         everything: all stores of the kernel.
         row: the name of the array.
     """
-    graphs: dict[int, list[Value]] = {}  # one for each piece: pieces write their own entries after all have read
+    graphs: dict[int, list[Value]] = {}  # one for each segment: segments write their own entries after all have read
     for item in everything:
         if not is_constant(item.value):
             graphs.setdefault(id(item.value.graph), []).append(item.value)
@@ -148,7 +160,7 @@ def is_read_before_written(stores: list[Store], everything: list[Store], row: st
     return True
 
 
-def arrange_stores(stores: list[Store], result: Result) -> tuple[list[Store], list[int] | None]:
+def arrange_stores(stores: list[Store], result: ResultLayout) -> tuple[list[Store], list[int] | None]:
     """Return the stores of the result in the form that its way of leaving requires, and the slot of each entry.
 
     Results with slots get one store for each distinct value; an entry's slot is -1 where its value is zero. All other

@@ -21,10 +21,10 @@ THREADS = 64  # of a block: doubling has few threads, and more blocks use more o
 
 
 @dataclasses.dataclass(frozen=True)
-class Round:
+class DoublingRound:
     """E^(2^r): the tables of its blocks on the device, the nodes that have one, and the scalars of all blocks."""
 
-    tables: kernels.Round
+    tables: kernels.DoublingTables
     nodes: wp.array
     scalars: int
     widest: int
@@ -92,21 +92,21 @@ class Doubling:
             x = y
 
 
-def _rounds(tree: Tree, dims: Sequence[int], offsets: Any, device: wp.Device) -> list[Round]:
+def _rounds(tree: Tree, dims: Sequence[int], offsets: Any, device: wp.Device) -> list[DoublingRound]:
     """Return E, E^2, E^4, ... as long as they have blocks."""
     size = np.asarray(dims, np.int32)
     start = np.cumsum([0, *size[:-1]])
     common = {"row_node": np.repeat(np.arange(len(size)), size), "start": start, "size": size}
     shared = {name: _table(values, device) for name, values in common.items()}
     ancestor, offset = np.asarray(tree.parent), np.asarray(offsets)
-    found: list[Round] = []
+    found: list[DoublingRound] = []
     while (ancestor >= 0).any():
         nodes = np.flatnonzero(ancestor >= 0)
         scalars = size[nodes] * size[ancestor[nodes]]
         if found:
             offset = np.zeros(len(size), np.int64)
             offset[nodes] = np.cumsum([0, *scalars[:-1]])
-        tables: Any = kernels.Round()
+        tables: Any = kernels.DoublingTables()
         lists = {
             "ancestor": ancestor,
             "offset": offset,
@@ -117,7 +117,7 @@ def _rounds(tree: Tree, dims: Sequence[int], offsets: Any, device: wp.Device) ->
             setattr(tables, name, _table(values, device))
         for name, table in shared.items():
             setattr(tables, name, table)
-        found.append(Round(tables, _table(nodes, device), int(scalars.sum()), int(scalars.max())))
+        found.append(DoublingRound(tables, _table(nodes, device), int(scalars.sum()), int(scalars.max())))
         ancestor = np.where(ancestor >= 0, ancestor[ancestor], -1)
     return found
 

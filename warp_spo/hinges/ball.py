@@ -8,11 +8,11 @@ import numpy as np
 
 from ..trace.scalars import Value, is_constant, reciprocal, sqrt
 from ..trace.spatial import ZERO, Matrix, Pose, Vector, cross, dot
-from .hinge_type import BALL, Carrier, Entry, Kind, Placed, Twist
-from .quaternions import Quaternion, multiplied, quaternion_rotation, rotated_by, rotation_vector
+from .hinge_type import BALL, Carrier, Entry, HingeType, LinkPlacement, Twist
+from .quaternions import Quaternion, multiply, quaternion_rotation, rotate_by, rotation_vector
 
 
-class Ball(Kind):
+class Ball(HingeType):
     name = "ball"
     dofs = 3
     coordinates = 4
@@ -30,73 +30,75 @@ class Ball(Kind):
         return [(x, 1.0, 0.0) for x in np.eye(3)]
 
     # -- position --------------------------------------------------------------------------------------------------
-    def placed(self, link: Carrier, q: Entry) -> Placed:
+    def transform(self, link: Carrier, q: Entry) -> LinkPlacement:
         matrix = link.matrix
         l = self._anchor(link, q)
-        turned = quaternion_rotation(*self.turn(link, q))
-        R = turned if matrix is None else matrix @ turned
-        return Placed(Pose(None, R, l + R @ link.com), turned)
+        hinge_rotation = quaternion_rotation(*self.raw_quaternion(link, q))
+        R = hinge_rotation if matrix is None else matrix @ hinge_rotation
+        return LinkPlacement(Pose(None, R, l + R @ link.com), hinge_rotation)
 
     def _anchor(self, link: Carrier, q: Entry) -> Vector:
         """The child anchor in the parent link's frame."""
         return link.offset
 
-    def turn(self, link: Carrier, q: Entry) -> Quaternion:
+    def raw_quaternion(self, link: Carrier, q: Entry) -> Quaternion:
         """The quaternion among the coordinates, of any length."""
         first = link.coordinate + self.quaternion
         return Vector(q(first + i) for i in range(4))
 
     def relative_quaternion(self, link: Carrier, q: Entry) -> Quaternion:
         rest = self.quaternion_at_rest(link)
-        x, y, z, w = self.turn(link, q)
+        x, y, z, w = self.raw_quaternion(link, q)
         scale = reciprocal(sqrt((x * x + y * y) + (z * z + w * w)))
-        return multiplied(rest, Vector((x, y, z, w)) * scale)
+        return multiply(rest, Vector((x, y, z, w)) * scale)
 
     # -- velocity, force, acceleration -----------------------------------------------------------------------------
-    def velocity(self, place: Placed, rates: list[Value]) -> Twist:
-        return back(place) @ Vector(rates), ZERO
+    def velocity(self, place: LinkPlacement, rates: list[Value]) -> Twist:
+        return inverse_hinge_rotation(place) @ Vector(rates), ZERO
 
-    def forces(self, place: Placed, w: Vector, v: Vector) -> list[Value]:
-        return list(turned(place) @ w)
+    def forces(self, place: LinkPlacement, w: Vector, v: Vector) -> list[Value]:
+        return list(hinge_rotation(place) @ w)
 
-    def in_link_axes(self, place: Placed, triple: list[Value]) -> Vector:
-        return back(place) @ Vector(triple)
+    def in_link_axes(self, place: LinkPlacement, triple: list[Value]) -> Vector:
+        return inverse_hinge_rotation(place) @ Vector(triple)
 
-    def inertial_columns(self, link: Carrier, place: Placed, parent: Matrix, axes: Matrix, arm: Vector) -> list[Twist]:
+    def inertial_columns(
+        self, link: Carrier, place: LinkPlacement, parent: Matrix, axes: Matrix, arm: Vector
+    ) -> list[Twist]:
         hinge = parent if link.matrix is None else parent @ link.matrix
         arm = axes @ arm
         return [(axis, cross(axis, arm)) for axis in hinge.T]
 
     # -- motion of the coordinates ---------------------------------------------------------------------------------
-    def moved(self, link: Carrier, q: Entry, rates: list[Value], h: Value) -> list[Value]:
-        return list(rotated_by(self.turn(link, q), Vector(rates) * h))
+    def integrate(self, link: Carrier, q: Entry, rates: list[Value], h: Value) -> list[Value]:
+        return list(rotate_by(self.raw_quaternion(link, q), Vector(rates) * h))
 
     def difference(self, link: Carrier, before: Entry, after: Entry) -> list[Value]:
-        return list(rotation_vector(self.turn(link, after), self.turn(link, before)))
+        return list(rotation_vector(self.raw_quaternion(link, after), self.raw_quaternion(link, before)))
 
-    def nudged(self, link: Carrier, place: Placed, q: Entry, step: list[Value]) -> list[Value]:
+    def perturb(self, link: Carrier, place: LinkPlacement, q: Entry, step: list[Value]) -> list[Value]:
         if all(is_constant(x) and x == 0.0 for x in step):
             return [q(link.coordinate + i) for i in range(self.coordinates)]
-        return self._nudged(link, place, q, step)
+        return self._perturb(link, place, q, step)
 
-    def _nudged(self, link: Carrier, place: Placed, q: Entry, step: list[Value]) -> list[Value]:
-        turn = multiplied(Vector((*(0.5 * x for x in step[-3:]), 1.0)), self.turn(link, q))
+    def _perturb(self, link: Carrier, place: LinkPlacement, q: Entry, step: list[Value]) -> list[Value]:
+        turn = multiply(Vector((*(0.5 * x for x in step[-3:]), 1.0)), self.raw_quaternion(link, q))
         return list(turn * reciprocal(sqrt(dot(turn, turn))))
 
     def coordinate_rates(self, link: Carrier, q: Entry, rates: list[Value]) -> list[Value]:
-        quaternion = self.turn(link, q)
-        return list(multiplied(Vector((*(Vector(rates) * 0.5), 0.0)), quaternion))
+        quaternion = self.raw_quaternion(link, q)
+        return list(multiply(Vector((*(Vector(rates) * 0.5), 0.0)), quaternion))
 
-    def tangent(self, link: Carrier, place: Placed, q: Entry, gradient: list[Value]) -> list[Value]:
-        (*u, w), (*g_u, g_w) = self.turn(link, q), gradient[self.quaternion :]
+    def to_tangent(self, link: Carrier, place: LinkPlacement, q: Entry, gradient: list[Value]) -> list[Value]:
+        (*u, w), (*g_u, g_w) = self.raw_quaternion(link, q), gradient[self.quaternion :]
         return list((Vector(g_u) * w + cross(u, g_u) - Vector(u) * g_w) * 0.5)
 
-    def untangent(self, link: Carrier, place: Placed, q: Entry, rates: list[Value]) -> list[Value]:
+    def from_tangent(self, link: Carrier, place: LinkPlacement, q: Entry, rates: list[Value]) -> list[Value]:
         turn, linear = Vector(rates[-3:]) * 0.5, self._linear(link, place, rates)
-        *u, w = self.turn(link, q)
+        *u, w = self.raw_quaternion(link, q)
         return [*linear, *(turn * w + cross(turn, u)), -sum((a * b for a, b in zip(turn, u, strict=True)), 0.0)]
 
-    def _linear(self, link: Carrier, place: Placed, rates: list[Value]) -> list[Value]:
+    def _linear(self, link: Carrier, place: LinkPlacement, rates: list[Value]) -> list[Value]:
         """Return the changes of the coordinates before the quaternion along tangent coordinates."""
         return []
 
@@ -105,10 +107,10 @@ class Ball(Kind):
         return rotation_vector(now, then)[i % 3]
 
 
-def turned(place: Placed) -> Matrix:
+def hinge_rotation(place: LinkPlacement) -> Matrix:
     assert place.turned is not None
     return place.turned
 
 
-def back(place: Placed) -> Matrix:
-    return turned(place).T
+def inverse_hinge_rotation(place: LinkPlacement) -> Matrix:
+    return hinge_rotation(place).T

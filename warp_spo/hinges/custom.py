@@ -19,8 +19,8 @@ from ..trace.differentiation import forward
 from ..trace.functions import AbstractScalar
 from ..trace.scalars import Graph, Value, cut, is_constant
 from ..trace.spatial import ZERO, Matrix, Pose, Vector, dot
-from .hinge_type import Carrier, Entry, Kind, Placed, Twist
-from .quaternions import Quaternion, matrix_quaternion, multiplied
+from .hinge_type import Carrier, Entry, HingeType, LinkPlacement, Twist
+from .quaternions import Quaternion, matrix_quaternion, multiply
 
 MOST = 6
 SAMPLES = 64  # configurations at which a rotation is checked
@@ -28,7 +28,7 @@ ORTHONORMAL = 1e-9  # largest entry of R* R - 1 that rounding and the user's con
 RANGE = (-1.0, 1.0)  # where a coordinate without limits is sampled
 
 
-class Shape(NamedTuple):
+class CustomPose(NamedTuple):
     """A custom hinge at a configuration.
 
     Attributes:
@@ -41,7 +41,7 @@ class Shape(NamedTuple):
     columns: list[Twist]
 
 
-class Custom(Kind):
+class Custom(HingeType):
     """A hinge whose pose is ``pose(q)``, for ``coordinates`` abstract scalars."""
 
     name = "custom"
@@ -56,7 +56,7 @@ class Custom(Kind):
         return self.name, self.pose
 
     # -- position --------------------------------------------------------------------------------------------------
-    def evaluated(self, x: list[Any]) -> tuple[Vector, Matrix]:
+    def evaluate(self, x: list[Any]) -> tuple[Vector, Matrix]:
         """Return p and R for coordinates that are numbers or traced.
 
         Raises:
@@ -80,8 +80,8 @@ class Custom(Kind):
             raise ValueError(wrong)
         return entries[0], Matrix(entries[1:])
 
-    def _shape(self, x: list[Value]) -> tuple[Vector, Shape]:
-        position, R = self.evaluated(x)
+    def _shape(self, x: list[Value]) -> tuple[Vector, CustomPose]:
+        position, R = self.evaluate(x)
         slopes, columns = [], []
         for i in range(self.dofs):
             changes = forward([*position, *(entry for row in R for entry in row)], x, _unit(i, self.dofs))
@@ -89,37 +89,39 @@ class Custom(Kind):
             a, b = R.T, turned.T
             slopes.append(slope)
             columns.append((Vector((dot(a[2], b[1]), dot(a[0], b[2]), dot(a[1], b[0]))), a @ slope))
-        return position, Shape(x, R, slopes, columns)
+        return position, CustomPose(x, R, slopes, columns)
 
-    def placed(self, link: Carrier, q: Entry) -> Placed:
+    def transform(self, link: Carrier, q: Entry) -> LinkPlacement:
         x = [cut(q(link.coordinate + i)) for i in range(self.coordinates)]
         position, shape = self._shape(x)
         if link.matrix is None:
-            return Placed(Pose(None, shape.rotation, link.offset + position), None, shape)
+            return LinkPlacement(Pose(None, shape.rotation, link.offset + position), None, shape)
         pose = Pose(None, link.matrix @ shape.rotation, link.offset + link.matrix @ position)
-        return Placed(pose, None, shape)
+        return LinkPlacement(pose, None, shape)
 
     def relative_quaternion(self, link: Carrier, q: Entry) -> Quaternion:
-        place = self.placed(link, q)
-        return multiplied(self.quaternion_at_rest(link), matrix_quaternion(place.own.rotation))
+        place = self.transform(link, q)
+        return multiply(self.quaternion_at_rest(link), matrix_quaternion(place.own.rotation))
 
     # -- velocity, force, acceleration -----------------------------------------------------------------------------
-    def velocity(self, place: Placed, rates: list[Value]) -> Twist:
+    def velocity(self, place: LinkPlacement, rates: list[Value]) -> Twist:
         return _along(place.own.columns, rates)
 
-    def forces(self, place: Placed, w: Vector, v: Vector) -> list[Value]:
+    def forces(self, place: LinkPlacement, w: Vector, v: Vector) -> list[Value]:
         return [dot(w_i, w) + dot(v_i, v) for w_i, v_i in place.own.columns]
 
-    def own_bias(self, place: Placed, rates: list[Value]) -> Twist:
-        own: Shape = place.own
+    def own_bias(self, place: LinkPlacement, rates: list[Value]) -> Twist:
+        own: CustomPose = place.own
         spin, _ = _along(own.columns, rates)
         velocity = sum((slope * rate for slope, rate in zip(own.slopes, rates, strict=True)), ZERO)
         moving = [rate for rate in rates if not is_constant(rate)]
         changes = forward([*spin, *velocity], [*own.x, *moving], [*rates, *[0.0] * len(moving)])
         return Vector(changes[:3]), own.rotation.T @ Vector(changes[3:])
 
-    def own_changes(self, place: Placed, rates: list[Value], accelerations: list[Value]) -> list[tuple[Twist, Twist]]:
-        own: Shape = place.own
+    def own_changes(
+        self, place: LinkPlacement, rates: list[Value], accelerations: list[Value]
+    ) -> list[tuple[Twist, Twist]]:
+        own: CustomPose = place.own
         bias = self.own_bias(place, rates)
         velocity, acceleration = _along(own.columns, rates), _along(own.columns, accelerations)
         outputs = [*velocity[0], *velocity[1], *(acceleration[0] + bias[0]), *(acceleration[1] + bias[1])]
@@ -131,15 +133,15 @@ class Custom(Kind):
             found.append(((parts[0], parts[1]), (parts[2], parts[3])))
         return found
 
-    def own_bias_changes(self, place: Placed, rates: list[Value]) -> list[Twist]:
+    def own_bias_changes(self, place: LinkPlacement, rates: list[Value]) -> list[Twist]:
         bias, found = [x for part in self.own_bias(place, rates) for x in part], []
         for rate in rates:
             changes = [0.0] * 6 if is_constant(rate) else forward(bias, [rate], [1.0])
             found.append((Vector(changes[:3]), Vector(changes[3:])))
         return found
 
-    def column_changes(self, place: Placed) -> list[list[Twist]]:
-        own: Shape = place.own
+    def column_changes(self, place: LinkPlacement) -> list[list[Twist]]:
+        own: CustomPose = place.own
         outputs = [x for w, v in own.columns for x in (*w, *v)]
         found = []
         for i in range(self.dofs):
@@ -150,7 +152,7 @@ class Custom(Kind):
         return found
 
 
-def checked(call: str, pose: Any, coordinates: Any, low: np.ndarray, high: np.ndarray) -> Custom:
+def check_custom_pose(call: str, pose: Any, coordinates: Any, low: np.ndarray, high: np.ndarray) -> Custom:
     """Return the hinge, after tracing its pose once and looking at its rotation at some configurations.
 
     Args:
@@ -168,7 +170,7 @@ def checked(call: str, pose: Any, coordinates: Any, low: np.ndarray, high: np.nd
     low, high = np.where(bounded, low, RANGE[0]), np.where(bounded, high, RANGE[1])
     for q in np.random.default_rng(0).uniform(low, high, (SAMPLES, coordinates)):
         with np.errstate(all="ignore"):
-            position, rotation = (np.array(x, dtype=np.float64) for x in kind.evaluated(list(q)))
+            position, rotation = (np.array(x, dtype=np.float64) for x in kind.evaluate(list(q)))
         error = np.abs(rotation.T @ rotation - np.eye(3)).max()
         if not (np.isfinite(position).all() and error < ORTHONORMAL and np.linalg.det(rotation) > 0.0):
             raise ValueError(

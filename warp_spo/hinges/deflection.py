@@ -15,7 +15,7 @@ import numpy as np
 
 from ..trace.scalars import Value, cos, sin
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, dot, skew
-from .custom import Custom, Shape
+from .custom import Custom, CustomPose
 
 TERMS = 11  # of the series of a rotation by a vector: exact to 1e-15 up to 1.9 rad, to 3e-12 up to half a turn
 PARALLEL = 1e-12  # part of the slopes across the first axis below which all of them turn about it
@@ -39,19 +39,19 @@ class Deflection(Custom):
     def shape(self) -> Hashable:
         return self.name, self.slopes.tobytes(), None if self.stiffening is None else self.stiffening.tobytes()
 
-    def evaluated(self, x: list[Any]) -> tuple[Vector, Matrix]:
+    def evaluate(self, x: list[Any]) -> tuple[Vector, Matrix]:
         """Return displacement and rotation for amplitudes ``x``."""
         position, shape = self._shape(x)
         return position, shape.rotation
 
-    def _shape(self, x: list[Any]) -> tuple[Vector, Shape]:
+    def _shape(self, x: list[Any]) -> tuple[Vector, CustomPose]:
         linear, bent = self.slopes[3:].tolist(), [[0.0] * self.dofs] * 3  # T, and G eta
         if self.stiffening is not None:
             bent = [[dot(row, x) for row in G] for G in self.stiffening.tolist()]
         position = Vector(dot(row, x) - 0.5 * dot(x, curve) for row, curve in zip(linear, bent, strict=True))
         R, turns = rotation(self.slopes[:3], x)
         slopes = [Vector(linear[c][i] - bent[c][i] for c in range(3)) for i in range(self.dofs)]
-        return position, Shape(x, R, slopes, [(turn, R.T @ v) for turn, v in zip(turns, slopes, strict=True)])
+        return position, CustomPose(x, R, slopes, [(turn, R.T @ v) for turn, v in zip(turns, slopes, strict=True)])
 
 
 def rotation(slopes: np.ndarray, x: list[Any]) -> tuple[Matrix, list[Vector]]:

@@ -7,17 +7,17 @@ from typing import Any
 
 from .ball import Ball
 from .free import Free
-from .helical import Helix
-from .hinge_type import Element
-from .prismatic import Slide
-from .revolute import Turn
+from .helical import Helical
+from .hinge_type import ElementaryHinge
+from .prismatic import Prismatic
+from .revolute import Revolute
 
 BY_NAME = {kind.name: kind for kind in (Ball(), Free())}
 """Hinges of one elementary hinge without an axis, by the name that users give; a new kind is one line here."""
-TURN, SLIDE = Turn(), Slide()
+REVOLUTE, PRISMATIC = Revolute(), Prismatic()
 
 
-def elements(name: str, screws: Iterable[tuple[Any, float, float]]) -> tuple[Element, ...]:
+def elements(name: str, screws: Iterable[tuple[Any, float, float]]) -> tuple[ElementaryHinge, ...]:
     """Return the elementary hinges of a hinge, inboard first.
 
     Args:
@@ -25,11 +25,11 @@ def elements(name: str, screws: Iterable[tuple[Any, float, float]]) -> tuple[Ele
         screws: (axis, radians, metres per unit of the coordinate).
     """
     if name in BY_NAME:
-        return (Element(BY_NAME[name]),)
+        return (ElementaryHinge(BY_NAME[name]),)
     return tuple(_of_screw(axis, float(angular), float(linear)) for axis, angular, linear in screws)
 
 
-def _of_screw(axis: Any, angular: float, linear: float) -> Element:
+def _of_screw(axis: Any, angular: float, linear: float) -> ElementaryHinge:
     if angular == 0.0:
-        return Element(SLIDE, axis)
-    return Element(TURN if linear == 0.0 else Helix(linear / angular), axis)
+        return ElementaryHinge(PRISMATIC, axis)
+    return ElementaryHinge(REVOLUTE if linear == 0.0 else Helical(linear / angular), axis)

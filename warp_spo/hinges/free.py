@@ -10,8 +10,8 @@ import numpy as np
 
 from ..trace.scalars import Value
 from ..trace.spatial import ZERO, Matrix, Vector, cross
-from .ball import Ball, back, turned
-from .hinge_type import FREE, Carrier, Entry, Placed, Twist
+from .ball import Ball, hinge_rotation, inverse_hinge_rotation
+from .hinge_type import FREE, Carrier, Entry, LinkPlacement, Twist
 from .quaternions import quaternion_rotation
 
 
@@ -39,53 +39,55 @@ class Free(Ball):
         position = Vector(q(link.coordinate + i) for i in range(3))
         return link.offset + (position if link.matrix is None else link.matrix @ position)
 
-    def _arm(self, link: Carrier, place: Placed) -> Vector:
+    def _arm(self, link: Carrier, place: LinkPlacement) -> Vector:
         """From the anchor to the centre of mass, in the parent anchor's axes."""
-        return turned(place) @ link.com
+        return hinge_rotation(place) @ link.com
 
     # -- velocity, force, acceleration -----------------------------------------------------------------------------
-    def velocity(self, place: Placed, rates: list[Value]) -> Twist:
-        to_link = back(place)
+    def velocity(self, place: LinkPlacement, rates: list[Value]) -> Twist:
+        to_link = inverse_hinge_rotation(place)
         return to_link @ Vector(rates[3:]), to_link @ Vector(rates[:3])
 
-    def forces(self, place: Placed, w: Vector, v: Vector) -> list[Value]:
-        to_hinge = turned(place)
+    def forces(self, place: LinkPlacement, w: Vector, v: Vector) -> list[Value]:
+        to_hinge = hinge_rotation(place)
         w = to_hinge @ w
         return [*(to_hinge @ v), *w]
 
-    def inertial_columns(self, link: Carrier, place: Placed, parent: Matrix, axes: Matrix, arm: Vector) -> list[Twist]:
+    def inertial_columns(
+        self, link: Carrier, place: LinkPlacement, parent: Matrix, axes: Matrix, arm: Vector
+    ) -> list[Twist]:
         turns = super().inertial_columns(link, place, parent, axes, arm)
         return [*((ZERO, axis) for axis, _ in turns), *turns]
 
     # -- motion of the coordinates ---------------------------------------------------------------------------------
-    def moved(self, link: Carrier, q: Entry, rates: list[Value], h: Value) -> list[Value]:
+    def integrate(self, link: Carrier, q: Entry, rates: list[Value], h: Value) -> list[Value]:
         """The centre of mass moves in a straight line while the body turns about it."""
-        before = self.turn(link, q)
-        after = Vector(Ball.moved(self, link, q, rates[3:], h))
+        before = self.raw_quaternion(link, q)
+        after = Vector(Ball.integrate(self, link, q, rates[3:], h))
         shift = quaternion_rotation(*before) @ link.com - quaternion_rotation(*after) @ link.com
         return [*(q(link.coordinate + i) + h * rates[i] + shift[i] for i in range(3)), *after]
 
     def difference(self, link: Carrier, before: Entry, after: Entry) -> list[Value]:
         """The centre of mass goes straight from where the body is to where it will be."""
-        turns = [quaternion_rotation(*self.turn(link, q)) @ link.com for q in (before, after)]
+        turns = [quaternion_rotation(*self.raw_quaternion(link, q)) @ link.com for q in (before, after)]
         places = [Vector(q(link.coordinate + i) for i in range(3)) for q in (before, after)]
         return [*(places[1] - places[0] + (turns[1] - turns[0])), *super().difference(link, before, after)]
 
-    def _nudged(self, link: Carrier, place: Placed, q: Entry, step: list[Value]) -> list[Value]:
-        turn = super()._nudged(link, place, q, step)
+    def _perturb(self, link: Carrier, place: LinkPlacement, q: Entry, step: list[Value]) -> list[Value]:
+        turn = super()._perturb(link, place, q, step)
         arm = self._arm(link, place) - quaternion_rotation(*turn) @ link.com
         return [*(Vector(q(link.coordinate + i) for i in range(3)) + Vector(step[:3]) + arm), *turn]
 
     def coordinate_rates(self, link: Carrier, q: Entry, rates: list[Value]) -> list[Value]:
         quaternion_rate = super().coordinate_rates(link, q, rates[3:])
-        arm = quaternion_rotation(*self.turn(link, q)) @ link.com
+        arm = quaternion_rotation(*self.raw_quaternion(link, q)) @ link.com
         return [*(v - s for v, s in zip(rates[:3], cross(rates[3:], arm), strict=True)), *quaternion_rate]
 
-    def tangent(self, link: Carrier, place: Placed, q: Entry, gradient: list[Value]) -> list[Value]:
-        turn = Vector(super().tangent(link, place, q, gradient))
+    def to_tangent(self, link: Carrier, place: LinkPlacement, q: Entry, gradient: list[Value]) -> list[Value]:
+        turn = Vector(super().to_tangent(link, place, q, gradient))
         return [*gradient[:3], *(turn - cross(self._arm(link, place), gradient[:3]))]
 
-    def _linear(self, link: Carrier, place: Placed, rates: list[Value]) -> list[Value]:
+    def _linear(self, link: Carrier, place: LinkPlacement, rates: list[Value]) -> list[Value]:
         return list(Vector(rates[:3]) - cross(rates[3:], self._arm(link, place)))
 
     def displacement(self, i: int, q: Entry, rest: Entry) -> Value:

@@ -1,4 +1,4 @@
-"""Helix: one angle about the link's z axis, along which the link advances by a pitch [m/rad]."""
+"""Helical: one angle about the link's z axis, along which the link advances by a pitch [m/rad]."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import numpy as np
 
 from ..trace.scalars import Value, cos, reduced, sin
 from ..trace.spatial import IDENTITY, Matrix, Pose, Vector, cross
-from .hinge_type import SCREWS, Carrier, Entry, Kind, Placed, Twist
+from .hinge_type import SCREWS, Carrier, Entry, HingeType, LinkPlacement, Twist
 from .quaternions import Quaternion
-from .revolute import turned_about_z
+from .revolute import rotate_about_z
 
 Z = IDENTITY[2]
 
 
-class Helix(Kind):
+class Helical(HingeType):
     name = "helix"
     node_code = SCREWS
 
@@ -25,22 +25,24 @@ class Helix(Kind):
     def screws(self, axis: np.ndarray | None) -> list[tuple[Any, float, float]]:
         return [(axis, 1.0, self.pitch)]
 
-    def placed(self, link: Carrier, q: Entry) -> Placed:
+    def transform(self, link: Carrier, q: Entry) -> LinkPlacement:
         x = q(link.coordinate)
         angle = reduced(x)
         turn = (cos(angle), sin(angle))
         axis = Z if link.matrix is None else link.matrix.T[2]
-        return Placed(Pose(turn, link.matrix, link.offset + axis * (self.pitch * x)), None)
+        return LinkPlacement(Pose(turn, link.matrix, link.offset + axis * (self.pitch * x)), None)
 
     def relative_quaternion(self, link: Carrier, q: Entry) -> Quaternion:
-        return turned_about_z(self.quaternion_at_rest(link), q(link.coordinate))
+        return rotate_about_z(self.quaternion_at_rest(link), q(link.coordinate))
 
-    def velocity(self, place: Placed, rates: list[Value]) -> Twist:
+    def velocity(self, place: LinkPlacement, rates: list[Value]) -> Twist:
         return Z * rates[0], Z * (self.pitch * rates[0])
 
-    def forces(self, place: Placed, w: Vector, v: Vector) -> list[Value]:
+    def forces(self, place: LinkPlacement, w: Vector, v: Vector) -> list[Value]:
         return [w[2] + self.pitch * v[2]]
 
-    def inertial_columns(self, link: Carrier, place: Placed, parent: Matrix, axes: Matrix, arm: Vector) -> list[Twist]:
+    def inertial_columns(
+        self, link: Carrier, place: LinkPlacement, parent: Matrix, axes: Matrix, arm: Vector
+    ) -> list[Twist]:
         z = axes.T[2]
         return [(z, axes @ cross(Z, arm) + z * self.pitch)]

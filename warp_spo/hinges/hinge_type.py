@@ -34,7 +34,7 @@ class Carrier(Protocol):
     rest: Quaternion | None
 
 
-class Placed(NamedTuple):
+class LinkPlacement(NamedTuple):
     """A link at a configuration.
 
     Attributes:
@@ -48,14 +48,14 @@ class Placed(NamedTuple):
     own: Any = None
 
 
-class Element(NamedTuple):
+class ElementaryHinge(NamedTuple):
     """One elementary hinge of a scene's hinge: its kind, and the axis that it turns about or slides along, if one."""
 
-    kind: Kind
+    kind: HingeType
     axis: np.ndarray | None = None
 
 
-class Kind:
+class HingeType:
     """An elementary hinge.
 
     Attributes:
@@ -108,7 +108,7 @@ class Kind:
         return [(np.zeros(3), 0.0, 0.0)] * self.dofs
 
     # -- position --------------------------------------------------------------------------------------------------
-    def placed(self, link: Carrier, q: Entry) -> Placed:
+    def transform(self, link: Carrier, q: Entry) -> LinkPlacement:
         """Return the link where the coordinates put it."""
         raise NotImplementedError
 
@@ -124,62 +124,64 @@ class Kind:
         return Vector((0.0, 0.0, 0.0, 1.0)) if link.matrix is None else constant_quaternion(link.matrix)
 
     # -- velocity, force, acceleration -----------------------------------------------------------------------------
-    def velocity(self, place: Placed, rates: list[Value]) -> Twist:
+    def velocity(self, place: LinkPlacement, rates: list[Value]) -> Twist:
         """Return H* rates: (omega; v) of the link relative to its parent, in the link's axes."""
         raise NotImplementedError
 
-    def forces(self, place: Placed, w: Vector, v: Vector) -> list[Value]:
+    def forces(self, place: LinkPlacement, w: Vector, v: Vector) -> list[Value]:
         """Return H (w; v), an entry for each dof."""
         raise NotImplementedError
 
-    def inertial_columns(self, link: Carrier, place: Placed, parent: Matrix, axes: Matrix, arm: Vector) -> list[Twist]:
+    def inertial_columns(
+        self, link: Carrier, place: LinkPlacement, parent: Matrix, axes: Matrix, arm: Vector
+    ) -> list[Twist]:
         """Return (omega; v), in inertial axes, of a point at ``arm`` from the link's origin, per unit of each rate.
 
         ``axes`` are the link's, ``parent`` its parent's, both in the inertial frame; ``arm`` is in the link's axes.
         """
         return [(axes @ w, axes @ (v + cross(w, arm))) for w, v in self.columns(place)]
 
-    def columns(self, place: Placed) -> list[Twist]:
+    def columns(self, place: LinkPlacement) -> list[Twist]:
         """Return (omega; v) of H* for each dof."""
         units = [[1.0 if j == i else 0.0 for j in range(self.dofs)] for i in range(self.dofs)]
         return [self.velocity(place, unit) for unit in units]
 
-    def in_link_axes(self, place: Placed, triple: list[Value]) -> Vector:
+    def in_link_axes(self, place: LinkPlacement, triple: list[Value]) -> Vector:
         """Return three entries by dof, of one sort and in the axes of the rates, in the link's axes."""
         return Vector(triple)
 
     # -- columns that depend on the coordinates; None where they are constant in the link or in its parent ----------
-    def own_bias(self, place: Placed, rates: list[Value]) -> Twist | None:
+    def own_bias(self, place: LinkPlacement, rates: list[Value]) -> Twist | None:
         """Return the acceleration relative to a parent at rest, in the link's axes, at constant rates."""
         return None
 
-    def column_changes(self, place: Placed) -> list[list[Twist]] | None:
+    def column_changes(self, place: LinkPlacement) -> list[list[Twist]] | None:
         """Return d H*_j / dq_i in the link's axes, by i, then j."""
         return None
 
     def own_changes(
-        self, place: Placed, rates: list[Value], accelerations: list[Value]
+        self, place: LinkPlacement, rates: list[Value], accelerations: list[Value]
     ) -> list[tuple[Twist, Twist]] | None:
         """Return how H* qd and H* qdd + :meth:`own_bias` change with each coordinate, in the link's axes."""
         return None
 
-    def own_bias_changes(self, place: Placed, rates: list[Value]) -> list[Twist] | None:
+    def own_bias_changes(self, place: LinkPlacement, rates: list[Value]) -> list[Twist] | None:
         """Return how :meth:`own_bias` changes with each rate."""
         return None
 
     # -- motion of the coordinates ---------------------------------------------------------------------------------
-    def moved(self, link: Carrier, q: Entry, rates: list[Value], h: Value) -> list[Value]:
+    def integrate(self, link: Carrier, q: Entry, rates: list[Value], h: Value) -> list[Value]:
         """Return the coordinates after ``rates`` have been constant for ``h`` [s]; quaternions come out normalised."""
         return [q(link.coordinate + i) + h * rate for i, rate in enumerate(rates)]
 
     def difference(self, link: Carrier, before: Entry, after: Entry) -> list[Value]:
-        """Return the rates that take the coordinates from ``before`` to ``after`` in 1 s: :meth:`moved`, inverted.
+        """Return the rates that take the coordinates from ``before`` to ``after`` in 1 s: :meth:`integrate`, inverted.
 
         A rotation goes the short way round. The entries are asked for by index, as those of q.
         """
         return [after(link.coordinate + i) - before(link.coordinate + i) for i in range(self.coordinates)]
 
-    def nudged(self, link: Carrier, place: Placed, q: Entry, step: list[Value]) -> list[Value]:
+    def perturb(self, link: Carrier, place: LinkPlacement, q: Entry, step: list[Value]) -> list[Value]:
         """Return the coordinates after a small step of the dofs, exact to first order."""
         return [q(link.coordinate + i) + x for i, x in enumerate(step)]
 
@@ -187,12 +189,12 @@ class Kind:
         """Return the time derivatives of the coordinates; of a quaternion, of the unit one."""
         return rates
 
-    def tangent(self, link: Carrier, place: Placed, q: Entry, gradient: list[Value]) -> list[Value]:
+    def to_tangent(self, link: Carrier, place: LinkPlacement, q: Entry, gradient: list[Value]) -> list[Value]:
         """Return a gradient by the coordinates along the tangent coordinates, an entry for each dof."""
         return gradient
 
-    def untangent(self, link: Carrier, place: Placed, q: Entry, rates: list[Value]) -> list[Value]:
-        """Return how the coordinates change along tangent coordinates: the transpose of :meth:`tangent`."""
+    def from_tangent(self, link: Carrier, place: LinkPlacement, q: Entry, rates: list[Value]) -> list[Value]:
+        """Return how the coordinates change along tangent coordinates: the transpose of :meth:`to_tangent`."""
         return rates
 
     def displacement(self, i: int, q: Entry, rest: Entry) -> Value:
@@ -200,7 +202,7 @@ class Kind:
         return q(i) - rest(i)
 
     # -- inertia ---------------------------------------------------------------------------------------------------
-    def regrouped(self, own: Rigid) -> tuple[Rigid, Rigid] | None:
+    def split_inertia(self, own: Rigid) -> tuple[Rigid, Rigid] | None:
         """Return an inertia in two parts: one that the parent may carry as well, and the rest; None if there is none.
 
         The first part must be the same in the parent wherever the hinge is.

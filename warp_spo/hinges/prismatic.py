@@ -1,4 +1,4 @@
-"""Slide: one distance along the link's z axis."""
+"""Prismatic: one distance along the link's z axis."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
-from .hinge_type import SCREWS, Carrier, Entry, Kind, Placed, Twist
+from .hinge_type import SCREWS, Carrier, Entry, HingeType, LinkPlacement, Twist
 from .quaternions import Quaternion
 
 Z = IDENTITY[2]
 
 
-class Slide(Kind):
+class Prismatic(HingeType):
     name = "slide"
     node_code = SCREWS
     units = (5,)
@@ -22,23 +22,25 @@ class Slide(Kind):
     def screws(self, axis: np.ndarray | None) -> list[tuple[Any, float, float]]:
         return [(axis, 0.0, 1.0)]
 
-    def placed(self, link: Carrier, q: Entry) -> Placed:
+    def transform(self, link: Carrier, q: Entry) -> LinkPlacement:
         axis = Z if link.matrix is None else link.matrix.T[2]
-        return Placed(Pose(None, link.matrix, link.offset + axis * q(link.coordinate)), None)
+        return LinkPlacement(Pose(None, link.matrix, link.offset + axis * q(link.coordinate)), None)
 
     def relative_quaternion(self, link: Carrier, q: Entry) -> Quaternion:
         return self.quaternion_at_rest(link)
 
-    def velocity(self, place: Placed, rates: list[Value]) -> Twist:
+    def velocity(self, place: LinkPlacement, rates: list[Value]) -> Twist:
         return ZERO, Z * rates[0]
 
-    def forces(self, place: Placed, w: Vector, v: Vector) -> list[Value]:
+    def forces(self, place: LinkPlacement, w: Vector, v: Vector) -> list[Value]:
         return [v[2]]
 
-    def inertial_columns(self, link: Carrier, place: Placed, parent: Matrix, axes: Matrix, arm: Vector) -> list[Twist]:
+    def inertial_columns(
+        self, link: Carrier, place: LinkPlacement, parent: Matrix, axes: Matrix, arm: Vector
+    ) -> list[Twist]:
         return [(ZERO, axes.T[2])]
 
-    def regrouped(self, own: Rigid) -> tuple[Rigid, Rigid] | None:
+    def split_inertia(self, own: Rigid) -> tuple[Rigid, Rigid] | None:
         """Moments of inertia are the same wherever the link has slid."""
         still = Rigid(0.0, ZERO, own.inertia)
         return still, Rigid(own.mass, own.moment, symmetric(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))

@@ -14,7 +14,7 @@ Quaternion = Vector  # x, y, z, w
 SMALL = 1e-6  # squares of angles below this [rad^2] are taken by their series, whose next term is under 1e-14
 
 
-def multiplied(a: Quaternion, b: Quaternion) -> Quaternion:
+def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     """The rotation a after b."""
     u, v = Vector(a[:3]), Vector(b[:3])
     return Vector((*(u * b[3] + v * a[3] + cross(u, v)), a[3] * b[3] - total(x * y for x, y in zip(u, v, strict=True))))
@@ -78,7 +78,7 @@ def matrix_quaternion(m: Matrix) -> Quaternion:
     return Vector(best) * (0.5 * reciprocal(sqrt(square)))
 
 
-def rotated_by(q: Quaternion, turn: Vector) -> Quaternion:
+def rotate_by(q: Quaternion, turn: Vector) -> Quaternion:
     """exp(turn) q, of unit length."""
     half = turn * 0.5
     square = dot(half, half)
@@ -86,13 +86,13 @@ def rotated_by(q: Quaternion, turn: Vector) -> Quaternion:
     angle = sqrt(select(small, 1.0, square))  # the branch not taken stays finite, and its derivative too
     sinc = select(small, 1.0 - square * (1.0 / 6.0), sin(angle) * reciprocal(angle))
     cosine = select(small, 1.0 - square * 0.5 * (1.0 - square * (1.0 / 12.0)), cos(angle))
-    after = multiplied(Vector((*(half * sinc), cosine)), q)
+    after = multiply(Vector((*(half * sinc), cosine)), q)
     return after * reciprocal(sqrt(dot(after, after)))
 
 
 def rotation_vector(q: Quaternion, rest: Quaternion) -> Vector:
     """Of R(q) R(rest)*, no longer than pi, in the parent anchor's axes: q is ``rest`` turned by it."""
-    x, y, z, w = multiplied(q, Vector((-rest[0], -rest[1], -rest[2], rest[3])))
+    x, y, z, w = multiply(q, Vector((-rest[0], -rest[1], -rest[2], rest[3])))
     sign = select(less(w, 0.0), -1.0, 1.0)
     u, w = Vector((x, y, z)) * sign, w * sign
     square = dot(u, u)

@@ -1,4 +1,4 @@
-"""Turn: one angle about the link's z axis."""
+"""Revolute: one angle about the link's z axis."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import numpy as np
 
 from ..trace.scalars import Value, cos, sin
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, cross, symmetric
-from .hinge_type import SCREWS, Carrier, Entry, Kind, Placed, Twist
-from .quaternions import Quaternion, multiplied
+from .hinge_type import SCREWS, Carrier, Entry, HingeType, LinkPlacement, Twist
+from .quaternions import Quaternion, multiply
 
 Z = IDENTITY[2]
 ROUNDING = 1e-14  # moments of inertia that differ by this share of themselves are equal
 
 
-class Turn(Kind):
+class Revolute(HingeType):
     name = "turn"
     node_code = SCREWS
     units = (2,)
@@ -23,23 +23,25 @@ class Turn(Kind):
     def screws(self, axis: np.ndarray | None) -> list[tuple[Any, float, float]]:
         return [(axis, 1.0, 0.0)]
 
-    def placed(self, link: Carrier, q: Entry) -> Placed:
+    def transform(self, link: Carrier, q: Entry) -> LinkPlacement:
         angle = q(link.coordinate)
-        return Placed(Pose((cos(angle), sin(angle)), link.matrix, link.offset), None)
+        return LinkPlacement(Pose((cos(angle), sin(angle)), link.matrix, link.offset), None)
 
     def relative_quaternion(self, link: Carrier, q: Entry) -> Quaternion:
-        return turned_about_z(self.quaternion_at_rest(link), q(link.coordinate))
+        return rotate_about_z(self.quaternion_at_rest(link), q(link.coordinate))
 
-    def velocity(self, place: Placed, rates: list[Value]) -> Twist:
+    def velocity(self, place: LinkPlacement, rates: list[Value]) -> Twist:
         return Z * rates[0], ZERO
 
-    def forces(self, place: Placed, w: Vector, v: Vector) -> list[Value]:
+    def forces(self, place: LinkPlacement, w: Vector, v: Vector) -> list[Value]:
         return [w[2]]
 
-    def inertial_columns(self, link: Carrier, place: Placed, parent: Matrix, axes: Matrix, arm: Vector) -> list[Twist]:
+    def inertial_columns(
+        self, link: Carrier, place: LinkPlacement, parent: Matrix, axes: Matrix, arm: Vector
+    ) -> list[Twist]:
         return [(axes.T[2], axes @ (ZERO + cross(Z, arm)))]
 
-    def regrouped(self, own: Rigid) -> tuple[Rigid, Rigid] | None:
+    def split_inertia(self, own: Rigid) -> tuple[Rigid, Rigid] | None:
         """A rod on the axis is the same wherever the link is turned."""
         (xx, xy, xz), (_, yy, yz), (_, _, zz) = own.inertia
         handed = Rigid(own.mass, Vector((0.0, 0.0, own.moment[2])), symmetric(yy, yy, 0.0, 0.0, 0.0, 0.0))
@@ -47,7 +49,7 @@ class Turn(Kind):
         return handed, Rigid(0.0, Vector((*own.moment[:2], 0.0)), symmetric(xx, 0.0, zz, xy, xz, yz))
 
 
-def turned_about_z(rest: Quaternion, angle: Value) -> Quaternion:
+def rotate_about_z(rest: Quaternion, angle: Value) -> Quaternion:
     """The quaternion of ``rest`` after a turn about the link's z axis."""
     half = 0.5 * angle
-    return multiplied(rest, Vector((0.0, 0.0, sin(half), cos(half))))
+    return multiply(rest, Vector((0.0, 0.0, sin(half), cos(half))))

@@ -1,4 +1,4 @@
-"""Spin: a rotor that turns about the link's z axis by a ratio times one coordinate, and is symmetric about that axis.
+"""A rotor that turns about the link's z axis by a ratio times one coordinate, and is symmetric about that axis.
 
 Where it stands does not matter to its inertia: the link's axes do not turn with it, so that no sine is computed.
 """
@@ -9,12 +9,12 @@ from collections.abc import Hashable
 
 from ..trace.scalars import Value
 from ..trace.spatial import ZERO, Matrix, Pose, Rigid, Vector, cross
-from .hinge_type import Carrier, Entry, Kind, Placed, Twist
+from .hinge_type import Carrier, Entry, HingeType, LinkPlacement, Twist
 from .quaternions import Quaternion
-from .revolute import Turn, Z
+from .revolute import Revolute, Z
 
 
-class Spin(Kind):
+class RotorAxis(HingeType):
     name = "spin"
 
     def __init__(self, ratio: float):
@@ -24,20 +24,22 @@ class Spin(Kind):
     def shape(self) -> Hashable:
         return self.name, self.ratio
 
-    def placed(self, link: Carrier, q: Entry) -> Placed:
-        return Placed(Pose(None, link.matrix, link.offset), None)
+    def transform(self, link: Carrier, q: Entry) -> LinkPlacement:
+        return LinkPlacement(Pose(None, link.matrix, link.offset), None)
 
     def relative_quaternion(self, link: Carrier, q: Entry) -> Quaternion:
         return self.quaternion_at_rest(link)
 
-    def velocity(self, place: Placed, rates: list[Value]) -> Twist:
+    def velocity(self, place: LinkPlacement, rates: list[Value]) -> Twist:
         return Z * (self.ratio * rates[0]), ZERO
 
-    def forces(self, place: Placed, w: Vector, v: Vector) -> list[Value]:
+    def forces(self, place: LinkPlacement, w: Vector, v: Vector) -> list[Value]:
         return [self.ratio * w[2]]
 
-    def inertial_columns(self, link: Carrier, place: Placed, parent: Matrix, axes: Matrix, arm: Vector) -> list[Twist]:
+    def inertial_columns(
+        self, link: Carrier, place: LinkPlacement, parent: Matrix, axes: Matrix, arm: Vector
+    ) -> list[Twist]:
         return [(axes.T[2] * self.ratio, axes @ (ZERO + cross(Z * self.ratio, arm)))]
 
-    def regrouped(self, own: Rigid) -> tuple[Rigid, Rigid] | None:
-        return Turn().regrouped(own)
+    def split_inertia(self, own: Rigid) -> tuple[Rigid, Rigid] | None:
+        return Revolute().split_inertia(own)

@@ -15,7 +15,7 @@ from ..dynamics.operation import Argument
 from ..errors import as_names
 from ..execution.parameters import SHARED
 from ..runtime.arrays import Call
-from .operations import Program
+from .operations import JaxOperation
 
 if TYPE_CHECKING:
     from ..dynamics.dynamics import Dynamics
@@ -89,7 +89,7 @@ class Function:
         self._check_values()
         self.arguments = {one.name: one for one in operation.arrays if not one.written}
         self.arguments |= {name: Argument(name, "world, ...") for name in values}
-        self._programs: dict[tuple, Program] = {}
+        self._programs: dict[tuple, JaxOperation] = {}
         self.status = self._takes_status()
         self._check_options()
         self._check_precision()
@@ -112,7 +112,7 @@ class Function:
         columns = {name: array.shape[-1] if self._has_columns(name, array) else None for name, array in given.items()}
         key = alone, tuple(columns.items())
         if key not in self._programs:
-            self._programs[key] = Program(self, columns, alone)
+            self._programs[key] = JaxOperation(self, columns, alone)
         found = self._programs[key](*given.values())
         return jax.tree.map(lambda x: x[0], found) if alone else found
 

@@ -24,7 +24,7 @@ Arrays = tuple[Any, ...]
 Traced = Callable[..., tuple[jax.Array, ...]]
 
 
-class Program:
+class JaxOperation:
     """A :class:`Function` for some of its arguments, all of which are [row, ...].
 
     To make one compiles the kernels and runs them once, ahead of XLA's graphs.
@@ -40,7 +40,7 @@ class Program:
         self.options, self.columns, self.alone = function.options, columns, alone
         needed = filter(function.is_needed, function.arguments)
         self._absent: dict[str, Any] = {name: None for name in needed if name not in columns}
-        self._once: Program | None = None  # one of several repetitions
+        self._once: JaxOperation | None = None  # one of several repetitions
         self._status = ("status",) if function.status else ()
         self._traced: dict[bool | tuple[str, ...], Traced] = {}
         results = self._compute(self._samples())
@@ -78,7 +78,7 @@ class Program:
             yield given
             return
         values = {name: given[name][0] if name in SHARED else given[name] for name in names}
-        with self.dyn.recursions.turn.lock, self.dyn._gradients.at_values(values):
+        with self.dyn.recursions.call_order.lock, self.dyn._gradients.at_values(values):
             yield {name: array for name, array in given.items() if name not in names}
 
     def _arrays_to_write(self, names: tuple[str, ...]) -> dict[str, wp.array]:
@@ -149,7 +149,7 @@ class Program:
         """Return the result of repetitions, and the way back through each of them."""
         times, single = self.function.repeated
         if self._once is None:
-            self._once = Program(single, self.columns, self.alone)
+            self._once = JaxOperation(single, self.columns, self.alone)
         once = self._once
         names = [result.name for result in self.operation.results]
 

@@ -7,7 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from ..scene.collision_shapes import Shape
+from ..scene.collision_shapes import CollisionShape
 from ..scene.contacts import HeightField
 from .mechanism import xyzw
 from .source import Source
@@ -19,7 +19,7 @@ Pairs = dict[frozenset[int], int]  # number of an explicit pair by its two geoms
 KINDS = {"mesh": "hull", "hfield": "height field"}
 
 
-def collision_shapes(source: Source, moving: np.ndarray) -> list[Shape]:
+def collision_shapes(source: Source, moving: np.ndarray) -> list[CollisionShape]:
     """Return the collision shapes of a model, those that explicit pairs name included.
 
     ``moving`` says which bodies of the scene can move, bool [body]; body k of it is body k + 1 of the model.
@@ -99,12 +99,12 @@ def _margin(source: Source, geom: int, ground: int | None, pairs: Pairs) -> floa
     return float(sum(m.geom_margin[g] for g in (geom, ground) if g is not None))
 
 
-def _shape(source: Source, geom: int, friction: float | None, margin: float) -> Shape:
+def _shape(source: Source, geom: int, friction: float | None, margin: float) -> CollisionShape:
     m, kind = source.model, source.missing.get(geom) or _name(source.model, geom)
     names: tuple[str, ...] = ()
     if kind in ("mesh", "hfield"):
         names = (source.name(kind, int(m.geom_dataid[geom])),)
-    return Shape(
+    return CollisionShape(
         source.name("geom", geom) or (names[0] if names else ""),
         int(m.geom_bodyid[geom]) - 1,
         KINDS.get(kind, kind),

@@ -18,7 +18,7 @@ SITE = int(mujoco.mjtObj.mjOBJ_SITE)
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
-def read_ties(source: Source, mechanism: Mechanism) -> tuple[list[Loop], list[Coupling]]:
+def read_equality_constraints(source: Source, mechanism: Mechanism) -> tuple[list[Loop], list[Coupling]]:
     """Return the loops and the couplings of the active equality constraints.
 
     A connect is a ball, a weld is fixed. A joint equality of first order is a coupling, and so is a tendon equality in

@@ -9,13 +9,13 @@ from typing import Any
 
 import mujoco
 
-from ..scene.collision_shapes import NONE, Choice
+from ..scene.collision_shapes import NONE, ShapeSelection
 from ..scene.scene import Scene
 from .model import scene_of
 from .source import Source
 
 
-def read_mjcf(file: Path, floating: bool | None, repair: bool = True, choice: Choice = NONE) -> Scene:
+def read_mjcf(file: Path, floating: bool | None, repair: bool = True, selection: ShapeSelection = NONE) -> Scene:
     """Return the scene of an MJCF file; see :func:`warp_spo.load`. ``repair`` changes nothing: MuJoCo repairs nothing.
 
     Raises:
@@ -31,7 +31,7 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool = True, choice: Ch
     model, dropped, missing = compiled(file)
     source = Source(model, "load", str(file), missing)
     source.left_out += dropped
-    return scene_of(source, floating, choice)
+    return scene_of(source, floating, selection)
 
 
 def compiled(file: Path) -> tuple[mujoco.MjModel, list[str], dict[int, str]]:

@@ -10,11 +10,11 @@ import numpy as np
 
 from ..errors import UnsupportedError
 from ..scene.actuators import Keyframe
-from ..scene.collision_shapes import NONE, POINTS, Choice, moving_bodies
+from ..scene.collision_shapes import NONE, POINTS, ShapeSelection, moving_bodies
 from ..scene.scene import Scene
 from .actuators import read_actuators
 from .collision_shapes import collision_shapes
-from .equality_constraints import read_ties
+from .equality_constraints import read_equality_constraints
 from .mechanism import BALL, FREE, SIZES, Mechanism, rotation, scene_entries, xyzw
 from .source import Source
 from .unsupported_features import refuse_unsupported
@@ -61,11 +61,11 @@ def from_mujoco(model: Any, contacts: Any = None, ground: Any = None, points: in
             f"from_mujoco: got {type(model).__name__}; expected mujoco.MjModel, which "
             "mujoco.MjModel.from_xml_path(path) and mujoco.MjSpec.compile() return"
         )
-    return scene_of(Source(model), None, Choice(contacts, ground, points))
+    return scene_of(Source(model), None, ShapeSelection(contacts, ground, points))
 
 
-def scene_of(source: Source, floating: bool | None, choice: Choice = NONE) -> Scene:
-    """Return the scene of a source, its base as ``floating`` says, with contacts by ``choice``.
+def scene_of(source: Source, floating: bool | None, selection: ShapeSelection = NONE) -> Scene:
+    """Return the scene of a source, its base as ``floating`` says, with contacts by ``selection``.
 
     A warning says once what is left out.
     """
@@ -78,15 +78,15 @@ def scene_of(source: Source, floating: bool | None, choice: Choice = NONE) -> Sc
         raise
     except ValueError as error:  # of a body, a hinge or the scene, which know neither call nor file
         raise ValueError(f"{source.title}: {error}; correct the model") from None
-    choice, disabled = choice.unless(source.disabled("CONTACT") or source.disabled("CONSTRAINT"))
-    scene, lost = choice.applied(source.title, scene, lambda: collision_shapes(source, moving_bodies(scene)))
+    selection, disabled = selection.unless(source.disabled("CONTACT") or source.disabled("CONSTRAINT"))
+    scene, lost = selection.apply(source.title, scene, lambda: collision_shapes(source, moving_bodies(scene)))
     source.left_out += disabled + lost
-    _warn(source, choice.contacts is not None)
+    _warn(source, selection.contacts is not None)
     return scene
 
 
 def _scene(source: Source, mechanism: Mechanism) -> Scene:
-    loops, couplings = read_ties(source, mechanism)
+    loops, couplings = read_equality_constraints(source, mechanism)
     return Scene(
         mechanism.bodies,
         mechanism.hinges,

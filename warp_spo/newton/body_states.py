@@ -6,7 +6,7 @@ import newton
 import warp as wp
 
 from ..dynamics.dynamics import Dynamics
-from .layout import Layouts
+from .layout import StateLayouts
 
 
 class BodyStates:
@@ -17,7 +17,7 @@ class BodyStates:
         layouts: How Newton's state is laid out.
     """
 
-    def __init__(self, dynamics: Dynamics, layouts: Layouts):
+    def __init__(self, dynamics: Dynamics, layouts: StateLayouts):
         self._dynamics, self._layouts = dynamics, layouts
 
     def targets(self, state: newton.State) -> tuple[wp.array, wp.array] | None:

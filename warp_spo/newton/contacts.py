@@ -13,15 +13,15 @@ from newton import ShapeFlags
 from ..errors import UnsupportedError
 from ..kernels import declare
 from ..kernels import newton_contacts as kernels
-from ..scene.collision_shapes import Choice, moving_bodies
+from ..scene.collision_shapes import ShapeSelection, moving_bodies
 from ..scene.contacts import HEIGHTS
 from ..scene.scene import Scene
 from ..status import Status
 from .elevations import Elevations
 from .model_contacts import CONTACT_MATERIALS, ModelContacts, model_contacts
 from .pairs import ModelPairs, refuse_still
-from .slots import Slots
-from .worlds import Worlds, to_numpy
+from .slots import ContactSlots
+from .worlds import WorldRows, to_numpy
 
 MODES = ("auto", "ground", "pipeline", "none")
 ELEVATIONS = "heightfield_elevations"
@@ -31,14 +31,14 @@ VALUES = {f"shape_material_{material}": name for name, material in CONTACT_MATER
 
 def find_contacts(
     model: newton.Model,
-    worlds: Worlds,
+    worlds: WorldRows,
     scene: Scene,
     pairs: ModelPairs | None,
     mode: str,
     points: int,
     lacking: str,
     apart: bool,
-) -> ModelContacts | Slots | None:
+) -> ModelContacts | ContactSlots | None:
     """Return the contacts of a model's shapes with its ground, or slots for a list of contacts, None for neither.
 
     Args:
@@ -62,7 +62,7 @@ def find_contacts(
     if mode == "pipeline":
         if pairs is not None and pairs.still:
             refuse_still(model, worlds, scene, frozenset(), "contacts='pipeline'")
-        return Slots(model, worlds, scene, points, pairs)
+        return ContactSlots(model, worlds, scene, points, pairs)
     named = frozenset() if pairs is None else pairs.still
     found = _on_ground(model, worlds, scene, mode, points, apart, named)
     if found is not None or mode == "ground" or not model.shape_count:
@@ -71,7 +71,7 @@ def find_contacts(
         refuse_still(model, worlds, scene, named, "shapes in no pair")
         return None
     try:
-        return Slots(model, worlds, scene, points, pairs)
+        return ContactSlots(model, worlds, scene, points, pairs)
     except UnsupportedError as error:
         warn_of_contacts_left_out(model, str(error))
         return None
@@ -94,7 +94,7 @@ def warn_of_contacts_left_out(model: newton.Model, why: str, depth: int = 6) -> 
 
 def _on_ground(
     model: newton.Model,
-    worlds: Worlds,
+    worlds: WorldRows,
     scene: Scene,
     mode: str,
     points: int,
@@ -106,13 +106,13 @@ def _on_ground(
     ``named``: indices of shapes that stand still and that pairs have.
     """
     try:
-        made = model_contacts(model, worlds, scene, Choice(True, None, points), apart, named)
+        made = model_contacts(model, worlds, scene, ShapeSelection(True, None, points), apart, named)
     except UnsupportedError:
         if mode == "ground":
             raise
         return None
-    problem = f"left out: {', '.join(made.found.left_out)}" if made.found.left_out else ""
-    if made.found.soil is None:
+    problem = f"left out: {', '.join(made.selected.left_out)}" if made.selected.left_out else ""
+    if made.selected.ground_shape is None:
         problem = "a model whose ground is no level plane and no height field"
     if problem and mode == "ground":
         raise UnsupportedError("SolverSPO", f"contacts='ground': {problem}", "remove them, or pass contacts='none'")
@@ -140,11 +140,11 @@ class Materials:
 
     def _read_points(self, made: ModelContacts, device: wp.Device) -> None:
         """Read the shapes of all points, and which points each shape has."""
-        rows, soil = made.point_rows, made.soil_rows
-        assert soil is not None
+        rows, ground_rows = made.point_rows, made.ground_rows
+        assert ground_rows is not None
         self._rows = wp.array(rows, dtype=wp.int32, device=device)
-        self._soil: Any = wp.array(soil, dtype=wp.int32, device=device)
-        touched = np.concatenate([rows.ravel(), np.repeat(soil, rows.shape[1])])
+        self._ground_rows: Any = wp.array(ground_rows, dtype=wp.int32, device=device)
+        touched = np.concatenate([rows.ravel(), np.repeat(ground_rows, rows.shape[1])])
         point = np.tile(np.arange(rows.size), 2)[np.argsort(touched, kind="stable")]
         shapes, counts = np.unique(touched, return_counts=True)
         lists = (shapes, np.append(0, np.cumsum(counts)), point)
@@ -168,7 +168,7 @@ class Materials:
     def read(self, flat: wp.array) -> wp.array:
         """Return the means of a material [world, contact], in a buffer that the next call overwrites."""
         if self._rows is not None:
-            inputs, device = [self._rows, self._soil, flat], self._mean.device
+            inputs, device = [self._rows, self._ground_rows, flat], self._mean.device
             wp.launch(kernels.mean_materials(), self._rows.shape, inputs, [self._mean], device=device)
         if self._pairs is not None:
             self._pairs.mean(flat, self._mean)
@@ -176,13 +176,17 @@ class Materials:
 
 
 def sources_of(
-    model: newton.Model, worlds: Worlds, made: ModelContacts | Slots | None, pairs: ModelPairs | None, heights: bool
+    model: newton.Model,
+    worlds: WorldRows,
+    made: ModelContacts | ContactSlots | None,
+    pairs: ModelPairs | None,
+    heights: bool,
 ) -> dict[str, Materials | Elevations]:
     """Return what turns arrays of the model into values of contacts, by the names of VALUES; {} without contacts.
 
     Slots read materials themselves. ``heights``: elevations, too, if a height field is the ground.
     """
-    if isinstance(made, Slots) or (made is None and pairs is None):
+    if isinstance(made, ContactSlots) or (made is None and pairs is None):
         return {}
     materials = Materials(made, pairs, worlds.count, model.device)
     found: dict[str, Materials | Elevations] = dict.fromkeys((name for name in VALUES if name != ELEVATIONS), materials)
@@ -207,7 +211,11 @@ class StatusWords:
     """
 
     def __init__(
-        self, model: newton.Model, worlds: Worlds, made: ModelContacts | Slots | None, pairs: ModelPairs | None
+        self,
+        model: newton.Model,
+        worlds: WorldRows,
+        made: ModelContacts | ContactSlots | None,
+        pairs: ModelPairs | None,
     ):
         self._model, self._device, self._made = model, model.device, made
         partners = None if pairs is None else pairs.partners()
@@ -252,7 +260,7 @@ class StatusWords:
         They are UNSUPPORTED, and SLOTS where there are more of them than slots. If the solver computes contacts, those
         that are open at the poses ``body_q`` do not count.
         """
-        slots = self._made if isinstance(self._made, Slots) else None
+        slots = self._made if isinstance(self._made, ContactSlots) else None
         inputs = [contacts.rigid_contact_count, contacts.rigid_contact_shape0, contacts.rigid_contact_shape1]
         inputs += [self._model.shape_world, self.role, self._model.shape_body, self._partner]
         inputs.append(body_q if self._computes else None)
@@ -273,17 +281,17 @@ class StatusWords:
         wp.launch(kernels.clear(), len(self.kept), [mask], [self.kept], device=self._device)
 
 
-def _roles(model: newton.Model, worlds: Worlds, made: ModelContacts | Slots | None) -> np.ndarray:
+def _roles(model: newton.Model, worlds: WorldRows, made: ModelContacts | ContactSlots | None) -> np.ndarray:
     """Return what each shape is: STILL, GROUND, TOUCHING (its contacts with the ground are computed) or MOVING."""
     bodies = to_numpy(model, "shape_body") if model.shape_count else np.zeros(0, dtype=int)
     if made is None:
         return np.where(bodies >= 0, kernels.MOVING, kernels.STILL)
     moving = np.append(moving_bodies(made.scene), False)  # the last entry is the inertial frame's
     roles = np.where(moving[np.where(bodies >= 0, worlds.body_slot[bodies], -1)], kernels.MOVING, kernels.STILL)
-    if isinstance(made, Slots):
+    if isinstance(made, ContactSlots):
         roles[roles == kernels.STILL] = kernels.GROUND
         roles[made.shape_rows.ravel()] = kernels.TOUCHING
         return roles
     roles[made.point_rows.ravel()] = kernels.TOUCHING
-    roles[made.soil_rows] = kernels.GROUND
+    roles[made.ground_rows] = kernels.GROUND
     return roles

@@ -11,7 +11,7 @@ from newton import JointTargetMode
 
 from ..errors import UnsupportedError
 from ..scene.scene import Scene
-from .layout import Layout
+from .layout import FlatLayout
 from .worlds import to_numpy
 
 GAINS = ("joint_target_ke", "joint_target_kd")
@@ -65,7 +65,7 @@ class Drives:
             joint_effort_limit=np.where(self._driven, values["joint_effort_limit"], 0.0),
         )
 
-    def targets(self, control: newton.Control, q: Layout, qd: Layout) -> dict[str, wp.array]:
+    def targets(self, control: newton.Control, q: FlatLayout, qd: FlatLayout) -> dict[str, wp.array]:
         """Return the targets as arguments of ``Dynamics.step``.
 
         Args:
@@ -77,7 +77,7 @@ class Drives:
             return {}
         return self.read(control.joint_target_q, control.joint_target_qd if self.tracks_rates else None, q, qd)
 
-    def read(self, target_q: Any, target_qd: Any, q: Layout, qd: Layout) -> dict[str, wp.array]:
+    def read(self, target_q: Any, target_qd: Any, q: FlatLayout, qd: FlatLayout) -> dict[str, wp.array]:
         """Return Newton's targets as arguments of ``Dynamics.step``; None leaves the target velocities out."""
         found = {"target_q": q.read(target_q, "joint_target_q")}
         if target_qd is not None:

@@ -8,8 +8,8 @@ import numpy as np
 import warp as wp
 
 from ..dynamics.dynamics import Dynamics
-from ..kernels import newton_arrays as exchange
-from .layout import Layouts
+from ..kernels import newton_arrays
+from .layout import StateLayouts
 
 
 class JointForces:
@@ -26,7 +26,7 @@ class JointForces:
         turns_with_bodies: Whether a free joint has a parent body, so that tau depends on q.
     """
 
-    def __init__(self, dynamics: Dynamics, layouts: Layouts):
+    def __init__(self, dynamics: Dynamics, layouts: StateLayouts):
         self._dynamics, self._layouts = dynamics, layouts
         scene = dynamics.scene
         level = (scene.values["joint_X_p"][..., 3:6] == 0.0).all(axis=(0, 2))
@@ -57,7 +57,7 @@ class JointForces:
         wp.copy(out, tau)
         dim = (self._dynamics.worlds, len(self._rows))
         inputs = [self._rows, *self._axes(q, anchors)]
-        wp.launch(exchange.turn_wrenches(wp.float32), dim, inputs, [out], device=self._dynamics.device)
+        wp.launch(newton_arrays.turn_wrenches(wp.float32), dim, inputs, [out], device=self._dynamics.device)
         return out
 
     def pull_back(
@@ -76,7 +76,7 @@ class JointForces:
         wrenches = self._layouts.qd.read(joint_f, "joint_f")
         inputs = [self._rows, *self._axes(q, anchors), wrenches]
         dynamics = self._dynamics
-        kernel = exchange.turn_gradients(wp.float32)
+        kernel = newton_arrays.turn_gradients(wp.float32)
         wp.launch(kernel, dynamics.worlds, inputs, [tau_grad, poses_grad], device=dynamics.device)
 
     def _axes(self, q: wp.array, anchors: wp.array) -> tuple[wp.array, wp.array]:

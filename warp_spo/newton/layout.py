@@ -11,13 +11,13 @@ import newton
 import numpy as np
 import warp as wp
 
-from ..kernels import newton_arrays as exchange
+from ..kernels import newton_arrays
 from ..runtime.memory import view
 from ..scene.scene import Scene
-from .worlds import Worlds
+from .worlds import WorldRows
 
 
-class Layout:
+class FlatLayout:
     """The entries of a flat array that belong to the scene.
 
     Args:
@@ -52,7 +52,7 @@ class Layout:
         if self.plain:
             return view(flat.ptr, self.shape, wp.float32, self.device.alias)
         out = self.buffer(name)
-        self._launch(exchange.gather, [self._index, _scalars(flat)], out.reshape(self._flat_shape))
+        self._launch(newton_arrays.gather, [self._index, _scalars(flat)], out.reshape(self._flat_shape))
         return out
 
     def target(self, flat: Any, name: str) -> wp.array:
@@ -63,11 +63,11 @@ class Layout:
     def write(self, array: wp.array, flat: Any, mask: Any = None) -> None:
         """Copy ``array`` [world, ...] into ``flat``, in the worlds of ``mask``; do nothing if it is a view of it."""
         if array.ptr != flat.ptr:
-            self._launch(exchange.scatter, [self._index, mask, array.reshape(self._flat_shape)], _scalars(flat))
+            self._launch(newton_arrays.scatter, [self._index, mask, array.reshape(self._flat_shape)], _scalars(flat))
 
     def add(self, array: wp.array, flat: Any) -> None:
         """Add ``array`` [world, ...] to the entries of ``flat``."""
-        self._launch(exchange.add, [self._index, array.reshape(self._flat_shape)], _scalars(flat))
+        self._launch(newton_arrays.add, [self._index, array.reshape(self._flat_shape)], _scalars(flat))
 
     def add_rows(self, array: wp.array, total: wp.array) -> None:
         """Add ``array`` to ``total``, both [world, ...] of the scene."""
@@ -75,7 +75,7 @@ class Layout:
             count = int(np.prod(self._flat_shape))
             entries = np.arange(count).reshape(self._flat_shape)
             self._own = self._index if self.plain else wp.array(entries, dtype=wp.int32, device=self.device)
-        self._launch(exchange.add, [self._own, array.reshape(self._flat_shape)], total.flatten())
+        self._launch(newton_arrays.add, [self._own, array.reshape(self._flat_shape)], total.flatten())
 
     def add_others(self, source: Any, flat: Any) -> None:
         """Add to ``flat`` those entries of ``source`` that no world of the scene has, such as those of loop joints."""
@@ -83,13 +83,13 @@ class Layout:
             return
         index, dim = self._others, self._others.shape
         found = wp.empty(dim, dtype=wp.float32, device=self.device)
-        wp.launch(exchange.gather(wp.float32), dim, [index, _scalars(source)], [found], device=self.device)
-        wp.launch(exchange.add(wp.float32), dim, [index, found], [_scalars(flat)], device=self.device)
+        wp.launch(newton_arrays.gather(wp.float32), dim, [index, _scalars(source)], [found], device=self.device)
+        wp.launch(newton_arrays.add(wp.float32), dim, [index, found], [_scalars(flat)], device=self.device)
 
     def scale(self, array: wp.array, factor: wp.array, name: str) -> wp.array:
         """Return ``array`` [world, n] times ``factor`` [n], in the buffer ``name``."""
         out = self.buffer(name)
-        self._launch(exchange.scale, [factor, array], out)
+        self._launch(newton_arrays.scale, [factor, array], out)
         return out
 
     def _check(self, flat: Any, name: str) -> None:
@@ -113,17 +113,17 @@ class Layout:
 
 
 @dataclasses.dataclass(frozen=True)
-class Layouts:
+class StateLayouts:
     """Layouts of Newton's state: joint_q, joint_qd, body_q, body_qd (as body_f), and the joints' anchors."""
 
-    q: Layout
-    qd: Layout
-    poses: Layout
-    wrenches: Layout
-    anchors: Layout
+    q: FlatLayout
+    qd: FlatLayout
+    poses: FlatLayout
+    wrenches: FlatLayout
+    anchors: FlatLayout
 
     @classmethod
-    def of(cls, model: newton.Model, worlds: Worlds, scene: Scene) -> Layouts:
+    def of(cls, model: newton.Model, worlds: WorldRows, scene: Scene) -> StateLayouts:
         """Return the layouts of a model's state."""
         rows = {
             "joint_q": (scene.q_index, ()),
@@ -135,9 +135,9 @@ class Layouts:
         return cls(*(lay_out(model, name, *found) for name, found in rows.items()))
 
 
-def lay_out(model: newton.Model, name: str, rows: np.ndarray, shape: tuple[int, ...] = ()) -> Layout:
+def lay_out(model: newton.Model, name: str, rows: np.ndarray, shape: tuple[int, ...] = ()) -> FlatLayout:
     """Return how the model's array ``name`` is laid out: ``rows`` [world, n], each an entry of ``shape``."""
-    return Layout(rows, (*rows.shape[1:], *shape), model.device, getattr(model, name))
+    return FlatLayout(rows, (*rows.shape[1:], *shape), model.device, getattr(model, name))
 
 
 def _scalars(flat: Any) -> wp.array:

@@ -14,17 +14,17 @@ from newton.solvers.experimental.coupled import CouplingInterface
 from ..dynamics.dynamics import Dynamics
 from ..errors import UnsupportedError
 from ..scene.frames import Frame
-from .layout import Layouts
+from .layout import StateLayouts
 from .tape import refuse_tape
 from .worlds import to_numpy
 
 
-class Plugs(CouplingInterface):
+class MassMatrixInterface(CouplingInterface):
     """Base class of SolverSPO with the methods by which other parts of Newton ask for its mass matrix."""
 
     model: newton.Model
     dynamics: Dynamics
-    _layouts: Layouts
+    _layouts: StateLayouts
     _body_rows: np.ndarray  # the model's bodies [world, body]
 
     def solve_inverse(self, state: newton.State) -> Callable[[wp.array, wp.array], None]:

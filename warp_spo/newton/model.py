@@ -16,11 +16,11 @@ from newton import JointTargetMode, JointType
 
 from ..errors import DirectedLoopError, UnsupportedError
 from ..recursions.step.joint_laws import DEFAULT_BOUND
-from ..scene.collision_shapes import POINTS, Choice
+from ..scene.collision_shapes import POINTS, ShapeSelection
 from ..scene.parts import DOF_VALUES, UNLIMITED, Body, Coupling, Hinge, Loop, checked_inertia
 from ..scene.scene import Scene
 from .model_contacts import with_model_contacts
-from .worlds import KINDS, Worlds, flat_entries, quote_labels, to_numpy, unit_pose
+from .worlds import KINDS, WorldRows, flat_entries, quote_labels, to_numpy, unit_pose
 
 ASYMMETRY = 1e-6  # relative asymmetry of an inertia that counts as rounding: R I R^T in float32 leaves a few 1e-7
 
@@ -60,7 +60,7 @@ def from_newton(model: newton.Model, contacts: Any = None, ground: Any = None, p
             f"from_newton: got {type(model).__name__}; expected newton.Model, which ModelBuilder.finalize() returns"
         )
     _refuse_tendons_and_constraints(model)
-    worlds = Worlds(model)
+    worlds = WorldRows(model)
     worlds.check_equal()
 
     # Entries of the model's joint_q and joint_qd that belong to each world's hinges.
@@ -78,10 +78,10 @@ def from_newton(model: newton.Model, contacts: Any = None, ground: Any = None, p
     differing = {name: array for name, array in values.items() if (array != array[:1]).any()}
     scene = scene.with_values(**differing)
     scene.q_index, scene.dof_index = q_index, dof_index
-    return with_model_contacts(model, worlds, scene, Choice(contacts, ground, points))
+    return with_model_contacts(model, worlds, scene, ShapeSelection(contacts, ground, points))
 
 
-def _values(worlds: Worlds, q_index: np.ndarray, dof_index: np.ndarray) -> dict[str, np.ndarray]:
+def _values(worlds: WorldRows, q_index: np.ndarray, dof_index: np.ndarray) -> dict[str, np.ndarray]:
     """Return the values of bodies and hinges, by Newton's names [world, ...], in float64."""
     read = lambda name, rows: to_numpy(worlds.model, name)[rows].astype(np.float64)  # noqa: E731
     values = {name: read(name, worlds.bodies) for name in ("body_mass", "body_com", "body_inertia")}
@@ -97,7 +97,7 @@ def _values(worlds: Worlds, q_index: np.ndarray, dof_index: np.ndarray) -> dict[
     return values
 
 
-def _bodies(worlds: Worlds, values: dict[str, np.ndarray]) -> list[Body]:
+def _bodies(worlds: WorldRows, values: dict[str, np.ndarray]) -> list[Body]:
     """Return the bodies of world 0."""
     masses, coms, inertias = (values[name][0] for name in ("body_mass", "body_com", "body_inertia"))
     labels = worlds.labels(worlds.model.body_label, worlds.bodies)
@@ -105,7 +105,7 @@ def _bodies(worlds: Worlds, values: dict[str, np.ndarray]) -> list[Body]:
     return [Body(mass, com, inertia, label, any_inertia=True) for mass, com, inertia, label in numbers]
 
 
-def _hinges(worlds: Worlds, values: dict[str, np.ndarray]) -> list[Hinge]:
+def _hinges(worlds: WorldRows, values: dict[str, np.ndarray]) -> list[Hinge]:
     """Return the hinges of world 0; where a scene has other values than the model, write them into ``values``."""
     hinges, q, dof = [], slice(0, 0), slice(0, 0)
     for joint, label in zip(worlds.hinges[0], worlds.labels(worlds.model.joint_label, worlds.hinges), strict=True):

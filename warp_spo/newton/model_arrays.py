@@ -13,8 +13,8 @@ from ..dynamics.dynamics import Dynamics
 from ..scene.parts import DOF_VALUES
 from .contacts import VALUES, Materials
 from .elevations import Elevations
-from .layout import Layout, Layouts, lay_out
-from .worlds import Worlds, to_numpy
+from .layout import FlatLayout, StateLayouts, lay_out
+from .worlds import WorldRows, to_numpy
 
 FORCE_VALUES = tuple(name for name in DOF_VALUES if name != "joint_armature")
 FLAGS = {
@@ -54,8 +54,8 @@ class ModelArrays:
     def __init__(
         self,
         model: newton.Model,
-        worlds: Worlds,
-        state: Layouts,
+        worlds: WorldRows,
+        state: StateLayouts,
         factors: Mapping[str, wp.array],
         sources: Mapping[str, Materials | Elevations],
     ):
@@ -142,7 +142,7 @@ class ModelArrays:
                 )
 
 
-def _layouts_of_values(model: newton.Model, worlds: Worlds, state: Layouts) -> dict[str, Layout]:
+def _layouts_of_values(model: newton.Model, worlds: WorldRows, state: StateLayouts) -> dict[str, FlatLayout]:
     """Return how the model's array is laid out, for each name that Dynamics may have as a variable value."""
     vectors = len(to_numpy(model, "gravity"))  # one for each world, or a last one for a model without worlds
     gravity = np.arange(worlds.count) if worlds.declared else np.full(worlds.count, vectors - 1)
@@ -154,5 +154,5 @@ def _layouts_of_values(model: newton.Model, worlds: Worlds, state: Layouts) -> d
         "body_mass": lay_out(model, "body_mass", worlds.bodies),
         "body_com": lay_out(model, "body_com", worlds.bodies, (3,)),
         "body_inertia": lay_out(model, "body_inertia", worlds.bodies, (3, 3)),
-        "gravity": Layout(gravity[:, None], (3,), model.device, model.gravity),
+        "gravity": FlatLayout(gravity[:, None], (3,), model.device, model.gravity),
     }

@@ -13,11 +13,11 @@ import numpy as np
 from newton import GeoType, ShapeFlags
 
 from ..errors import UnsupportedError
-from ..scene.collision_shapes import TURNED, Choice, Chosen, Shape
+from ..scene.collision_shapes import AXIS_TOLERANCE, CollisionShape, SelectedContacts, ShapeSelection
 from ..scene.contacts import HeightField, pose_matrix
 from ..scene.scene import Scene
 from .elevations import Fields
-from .worlds import Worlds, to_numpy, unit_pose
+from .worlds import WorldRows, to_numpy, unit_pose
 
 KINDS = {
     GeoType.PLANE: "plane",
@@ -56,7 +56,7 @@ class ModelShapes:
 
     ARRAYS = ("type", "body", "flags", "world", "transform", "scale", "margin", "collision_group")
 
-    def __init__(self, model: newton.Model, worlds: Worlds, materials: bool = True):
+    def __init__(self, model: newton.Model, worlds: WorldRows, materials: bool = True):
         self.model, self.worlds, self.materials = model, worlds, materials
         self._read = {name: to_numpy(model, f"shape_{name}") for name in self.ARRAYS if model.shape_count}
         self.others, self.rows = np.zeros(0, dtype=int), np.zeros((worlds.count, 0), dtype=int)
@@ -94,17 +94,17 @@ class ModelShapes:
             "make them equal, or add contacts with scene.with_contacts",
         )
 
-    def first(self) -> list[Shape]:
+    def first(self) -> list[CollisionShape]:
         """Return the shapes of world 0, and those outside of all worlds."""
         return [self._shape(int(i)) for i in (*self.rows[0], *self.others)]
 
-    def _shape(self, i: int) -> Shape:
+    def _shape(self, i: int) -> CollisionShape:
         model, read = self.model, self._read
         body, kind = int(read["body"][i]), GeoType(int(read["type"][i]))
         name = KINDS.get(kind, kind.name.lower())
         scale = read["scale"][i].astype(np.float64)
         mu, ke, kd = (float(self.material(key, i)) for key in ("mu", "ke", "kd"))
-        return Shape(
+        return CollisionShape(
             model.shape_label[i],
             body if body < 0 else int(self.worlds.body_slot[body]),
             "finite plane" if name == "plane" and scale[:2].any() else name,
@@ -136,31 +136,31 @@ class ModelShapes:
         """Return "mu", "ke" or "kd" of shapes, float64."""
         return to_numpy(self.model, f"shape_material_{name}")[rows].astype(np.float64)
 
-    def rows_of(self, shape: Shape) -> np.ndarray:
+    def rows_of(self, shape: CollisionShape) -> np.ndarray:
         """Return the index of a shape of world 0, or outside of all worlds, in each world [world]."""
         column = np.flatnonzero(self.rows[0] == shape.index)
         return self.rows[:, column[0]] if len(column) else np.full(len(self.rows), shape.index)
 
-    def grounds(self, soil: Shape, ground: Any, apart: bool) -> tuple[Any, dict[str, np.ndarray]]:
+    def grounds(self, ground_shape: CollisionShape, ground: Any, apart: bool) -> tuple[Any, dict[str, np.ndarray]]:
         """Return the ground of all worlds, and where and which it is in each: ``ground_origin``, ``ground_field``.
 
         Args:
-            soil: the ground of world 0, as a shape. ground: as a plane or a height field. apart: each shape is a field
-                of its own, though another one may have the same heights.
+            ground_shape: the ground of world 0. ground: the same as a plane or a height field. apart: each shape is a
+                field of its own, though another one may have the same heights.
         """
-        rows = self.rows_of(soil)
+        rows = self.rows_of(ground_shape)
         if (rows == rows[0]).all():
             return ground, {}
         poses = unit_pose(self._read["transform"][rows].astype(np.float64))
         heights = self._read["margin"][rows].astype(np.float64)
-        if soil.kind == "plane":
+        if ground_shape.kind == "plane":
             normals = np.array([pose_matrix(pose)[:3, 2] for pose in poses])
-            turned = np.abs(normals - normals[0]).max(axis=1) > TURNED
+            turned = np.abs(normals - normals[0]).max(axis=1) > AXIS_TOLERANCE
             if turned.any():
                 self._refuse(int(np.argmax(turned)), "has a plane with another normal")
             heights = heights + np.einsum("wi,i->w", poses[:, :3], ground.normal)
             return ground, {"ground_origin": (heights - heights[0])[:, None] * np.array(ground.normal)}
-        turned = np.abs(poses[:, 3:6]).max(axis=1) > TURNED
+        turned = np.abs(poses[:, 3:6]).max(axis=1) > AXIS_TOLERANCE
         if turned.any():
             self._refuse(int(np.argmax(turned)), "has a height field whose axes are turned")
         fields: list[HeightField] = []
@@ -187,7 +187,7 @@ class ModelShapes:
             values["ground_field"] = np.array(which, dtype=np.float64)[:, None]
         return ground, values
 
-    def touches(self, shape: Shape, ground: Shape) -> bool:
+    def touches(self, shape: CollisionShape, ground: CollisionShape) -> bool:
         """Whether Newton lets a shape collide with another: by groups, unless the pair is filtered out."""
         pair = (min(shape.index, ground.index), max(shape.index, ground.index))
         a, b = (int(self._read["collision_group"][one.index]) for one in (shape, ground))
@@ -199,37 +199,43 @@ class ModelContacts(NamedTuple):
     """A scene with the contacts of a model's collision shapes.
 
     Attributes:
-        scene: with contacts, ground and values by world. shapes: of the model. found: those that were chosen.
+        scene: with contacts, ground and values by world. shapes: of the model. selected: shapes and their contacts.
     """
 
     scene: Scene
     shapes: ModelShapes
-    found: Chosen
+    selected: SelectedContacts
 
     @property
     def point_rows(self) -> np.ndarray:
         """Index of the shape of each contact point [world, point]."""
         place = {int(row): column for column, row in enumerate(self.shapes.rows[0])}
-        columns = [place[shape.index] for shape, made in self.found.taken for one in made for _ in one.positions]
+        columns = [
+            place[shape.index] for shape, made in self.selected.contacts_by_shape for one in made for _ in one.positions
+        ]
         return self.shapes.rows[:, columns]
 
     @property
-    def soil_rows(self) -> np.ndarray | None:
+    def ground_rows(self) -> np.ndarray | None:
         """Index of the shape that is the ground [world]; None where the caller gives the ground."""
-        return None if self.found.soil is None else self.shapes.rows_of(self.found.soil)
+        return None if self.selected.ground_shape is None else self.shapes.rows_of(self.selected.ground_shape)
 
     @property
     def field_rows(self) -> np.ndarray | None:
         """Index of the shape that is each height field [field], where fields are ``apart``; None: no shape is one."""
-        rows, soil = self.soil_rows, self.found.soil
-        return None if rows is None or soil is None or soil.kind != "height field" else np.array([*dict.fromkeys(rows)])
+        rows, ground_shape = self.ground_rows, self.selected.ground_shape
+        return (
+            None
+            if rows is None or ground_shape is None or ground_shape.kind != "height field"
+            else np.array([*dict.fromkeys(rows)])
+        )
 
 
 def model_contacts(
     model: newton.Model,
-    worlds: Worlds,
+    worlds: WorldRows,
     scene: Scene,
-    choice: Choice,
+    selection: ShapeSelection,
     apart: bool = False,
     without: Collection[int] = (),
 ) -> ModelContacts:
@@ -241,29 +247,29 @@ def model_contacts(
     """
     shapes = ModelShapes(model, worlds)
     seen = [shape for shape in shapes.first() if shape.index not in without]
-    found = choice.resolve("from_newton", scene, seen, shapes.touches)
-    ground: Any = found.ground
+    selected = selection.resolve("from_newton", scene, seen, shapes.touches)
+    ground: Any = selected.ground
     values: dict[str, np.ndarray] = {}
-    if found.soil is not None:
-        ground, values = shapes.grounds(found.soil, ground, apart)
-    scene = scene.with_contacts([one for _, made in found.taken for one in made], ground)
-    made = ModelContacts(scene, shapes, found)
+    if selected.ground_shape is not None:
+        ground, values = shapes.grounds(selected.ground_shape, ground, apart)
+    scene = scene.with_contacts([one for _, made in selected.contacts_by_shape for one in made], ground)
+    made = ModelContacts(scene, shapes, selected)
     for name, key in CONTACT_MATERIALS.items():
         own = shapes.material(key, made.point_rows)
-        if made.soil_rows is not None:
-            own = 0.5 * (own + shapes.material(key, made.soil_rows)[:, None])
+        if made.ground_rows is not None:
+            own = 0.5 * (own + shapes.material(key, made.ground_rows)[:, None])
         values[name] = own
     values = {name: array for name, array in values.items() if (array != array[:1]).any()}
     return made._replace(scene=scene.with_values(**values))
 
 
-def with_model_contacts(model: newton.Model, worlds: Worlds, scene: Scene, choice: Choice) -> Scene:
+def with_model_contacts(model: newton.Model, worlds: WorldRows, scene: Scene, selection: ShapeSelection) -> Scene:
     """Return the scene, with contacts of chosen shapes of a model if some are wanted; warn of what is left out."""
-    if not choice.wants("from_newton"):
+    if not selection.wants("from_newton"):
         return scene
-    made = model_contacts(model, worlds, scene, choice)
-    if made.found.left_out:
-        warnings.warn(f"from_newton: left out: {', '.join(made.found.left_out)}", UserWarning, stacklevel=3)
+    made = model_contacts(model, worlds, scene, selection)
+    if made.selected.left_out:
+        warnings.warn(f"from_newton: left out: {', '.join(made.selected.left_out)}", UserWarning, stacklevel=3)
     return made.scene
 
 

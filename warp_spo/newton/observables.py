@@ -11,7 +11,7 @@ from newton.solvers import SolverBase
 
 from ..dynamics.dynamics import Dynamics
 from ..runtime.memory import view
-from .layout import Layouts
+from .layout import StateLayouts
 
 OF_CONTACTS = frozenset({"contact_f", "contact_slip", "contact_residual"})
 
@@ -46,7 +46,7 @@ class Observables(SolverBase.Observables):
     (world_count,)."""
 
 
-class Reports:
+class ObservableArrays:
     """Arrays of the observables of one solver. One kernel serves all steps with observables, whichever are asked for.
 
     Args:
@@ -67,7 +67,7 @@ class Reports:
     }
     """Names of all observables that some solver has."""
 
-    def __init__(self, dynamics: Dynamics, layouts: Layouts, paired: bool, substeps: int):
+    def __init__(self, dynamics: Dynamics, layouts: StateLayouts, paired: bool, substeps: int):
         self._dynamics, self._layouts, self._substeps = dynamics, layouts, substeps
         worlds, contacts = dynamics.worlds, dynamics.scene.contact_count
         self.status: Any = wp.zeros(worlds, dtype=wp.int32, device=dynamics.device)

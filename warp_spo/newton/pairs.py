@@ -14,12 +14,12 @@ from ..kernels import declare
 from ..kernels import newton_contacts as kernels
 from ..scene.contacts import GROUND_VALUES
 from ..scene.scene import Scene
-from ..scene.shape_pairs import PairChoice
+from ..scene.shape_pairs import PairSelection
 from .model_contacts import CONTACT_MATERIALS, ModelShapes
-from .worlds import Worlds
+from .worlds import WorldRows
 
 
-def find_pairs(model: newton.Model, worlds: Worlds, scene: Scene, asked: Any, lacking: str) -> ModelPairs | None:
+def find_pairs(model: newton.Model, worlds: WorldRows, scene: Scene, asked: Any, lacking: str) -> ModelPairs | None:
     """Return the pairs of a model's shapes that touch each other, None if none are asked for.
 
     Args:
@@ -35,9 +35,9 @@ def find_pairs(model: newton.Model, worlds: Worlds, scene: Scene, asked: Any, la
     return ModelPairs(model, worlds, scene, asked)
 
 
-def warn_of_bodies_apart(model: newton.Model, worlds: Worlds, scene: Scene) -> None:
+def warn_of_bodies_apart(model: newton.Model, worlds: WorldRows, scene: Scene) -> None:
     """Warn if bodies of separate trees may collide by a model's filters: they pass through each other."""
-    found = _choice(ModelShapes(model, worlds), scene).first_of_separate_trees()
+    found = _select_pairs(ModelShapes(model, worlds), scene).first_of_separate_trees()
     if found is not None:
         warnings.warn(
             f"SolverSPO: bodies that no joint connects pass through each other, such as "
@@ -48,13 +48,13 @@ def warn_of_bodies_apart(model: newton.Model, worlds: Worlds, scene: Scene) -> N
         )
 
 
-def refuse_still(model: newton.Model, worlds: Worlds, scene: Scene, named: frozenset[int], beside: str) -> None:
+def refuse_still(model: newton.Model, worlds: WorldRows, scene: Scene, named: frozenset[int], beside: str) -> None:
     """Raise an error if a shape stands still and is none of those that pairs have.
 
     A list of contacts would have those of pairs, too.
     """
-    choice = _choice(ModelShapes(model, worlds), scene)
-    others = [shape for shape in choice.shapes if not choice.moves(shape) and shape.index not in named]
+    selection = _select_pairs(ModelShapes(model, worlds), scene)
+    others = [shape for shape in selection.shapes if not selection.moves(shape) and shape.index not in named]
     if others:
         raise UnsupportedError(
             "SolverSPO",
@@ -64,10 +64,10 @@ def refuse_still(model: newton.Model, worlds: Worlds, scene: Scene, named: froze
         )
 
 
-def _choice(shapes: ModelShapes, scene: Scene) -> PairChoice:
+def _select_pairs(shapes: ModelShapes, scene: Scene) -> PairSelection:
     """Return what chooses pairs of a model's shapes."""
     first = shapes.first() if shapes.model.shape_count else []
-    return PairChoice("SolverSPO", scene, first, shapes.touches, {shape.index: shape for shape in first})
+    return PairSelection("SolverSPO", scene, first, shapes.touches, {shape.index: shape for shape in first})
 
 
 class ModelPairs:
@@ -83,13 +83,13 @@ class ModelPairs:
         still: Those of shapes that stand still, of the first world or outside of all worlds.
 
     Raises:
-        TypeError, ValueError, UnsupportedError: As :meth:`PairChoice.resolve`; or the worlds have different shapes.
+        TypeError, ValueError, UnsupportedError: As :meth:`PairSelection.resolve`; or the worlds have different shapes.
     """
 
-    def __init__(self, model: newton.Model, worlds: Worlds, scene: Scene, asked: Any):
+    def __init__(self, model: newton.Model, worlds: WorldRows, scene: Scene, asked: Any):
         self._shapes = ModelShapes(model, worlds)
-        choice = _choice(self._shapes, scene)
-        pairs, left_out = choice.resolve(asked)
+        selection = _select_pairs(self._shapes, scene)
+        pairs, left_out = selection.resolve(asked)
         if left_out:
             more = f" and {len(left_out) - 4} more" if len(left_out) > 4 else ""
             warnings.warn(
@@ -97,7 +97,7 @@ class ModelPairs:
                 UserWarning,
                 stacklevel=5,
             )
-        self.still = frozenset(pair.second.index for pair in pairs if not choice.moves(pair.second))
+        self.still = frozenset(pair.second.index for pair in pairs if not selection.moves(pair.second))
         self._contacts = [pair.contact() for pair in pairs]
         self.rows = np.array([[self._shapes.rows_of(pair[side]) for pair in pairs] for side in range(2)])
         self.rows = np.ascontiguousarray(self.rows.transpose(0, 2, 1))

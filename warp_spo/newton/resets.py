@@ -8,13 +8,18 @@ from newton import StateFlags
 
 from ..dynamics.dynamics import Dynamics
 from .body_states import BodyStates
-from .layout import Layouts
+from .layout import StateLayouts
 
 CLOSING_STEPS = 8  # iterations of Newton's method that close the loops in a reset; each squares the error
 
 
 def reset_state(
-    model: newton.Model, dynamics: Dynamics, layouts: Layouts, state: newton.State, flags: int, mask: wp.array | None
+    model: newton.Model,
+    dynamics: Dynamics,
+    layouts: StateLayouts,
+    state: newton.State,
+    flags: int,
+    mask: wp.array | None,
 ) -> None:
     """Reset arrays of a state, see :meth:`.solver.SolverSPO.reset`.
 

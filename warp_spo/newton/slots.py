@@ -18,15 +18,15 @@ from ..scene.scene import Scene
 from ..status import Status
 from .model_contacts import ModelShapes
 from .pairs import ModelPairs
-from .worlds import Worlds
+from .worlds import WorldRows
 
-ROUND = {"sphere": 4, "capsule": 4}
+MOST_SLOTS = {"sphere": 4, "capsule": 4}
 """Slots at most of shapes that touch in few points."""
-VARIABLE = ("contact_place", "contact_friction", "contact_stiffness", "contact_damping")
+SLOT_VALUES = ("contact_place", "contact_friction", "contact_stiffness", "contact_damping")
 """Values of the scene that the contacts of a step are."""
 
 
-class Slots:
+class ContactSlots:
     """Points of shapes that move, so many for each, whose places and materials a list of contacts gives at every step.
 
     Args:
@@ -43,7 +43,9 @@ class Slots:
         UnsupportedError: The worlds have different shapes, or no shape moves, or none stands still.
     """
 
-    def __init__(self, model: newton.Model, worlds: Worlds, scene: Scene, points: int, pairs: ModelPairs | None = None):
+    def __init__(
+        self, model: newton.Model, worlds: WorldRows, scene: Scene, points: int, pairs: ModelPairs | None = None
+    ):
         self._model, self._device, self._pairs = model, model.device, pairs
         shapes, moving = ModelShapes(model, worlds), moving_bodies(scene)
         contacts: list[Contact] = []
@@ -52,7 +54,7 @@ class Slots:
         for column, shape in enumerate(shapes.first()[: shapes.rows.shape[1]]):
             if shape.body < 0 or not moving[shape.body]:
                 continue
-            count = min(points, ROUND.get(shape.kind, points))
+            count = min(points, MOST_SLOTS.get(shape.kind, points))
             contacts += [Contact(shape.body, point=shape.pose[:3], label=shape.label)] * count
             columns, counts = [*columns, column], [*counts, count]
         still = [shape for shape in shapes.first() if shape.body < 0 or not moving[shape.body]]
@@ -74,7 +76,7 @@ class Slots:
         self._excess: Any = wp.zeros(worlds.count, dtype=wp.int32, device=device)
         self._place: Any = wp.zeros((*size, PLACE), dtype=wp.float32, device=device)
         wide = size[0], size[1] + (0 if pairs is None else pairs.count)
-        self._materials: list[Any] = [wp.zeros(wide, dtype=wp.float32, device=device) for _ in VARIABLE[1:]]
+        self._materials: list[Any] = [wp.zeros(wide, dtype=wp.float32, device=device) for _ in SLOT_VALUES[1:]]
         self._none = newton.Contacts(1, 0, device=device)
         declare(kernels, None)
 

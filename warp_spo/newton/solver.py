@@ -15,8 +15,7 @@ from ..dynamics.dynamics import Dynamics
 from ..dynamics.stepping.integrators import INTEGRATORS
 from ..dynamics.stepping.options import StepOptions, StepReport
 from ..errors import UnsupportedError, as_integer, as_names, never_copied, shown
-from ..kernels import declare
-from ..kernels import newton_arrays as exchange
+from ..kernels import declare, newton_arrays
 from ..runtime import launches
 from ..scene.collision_shapes import POINTS
 from ..scene.scene import Scene
@@ -24,18 +23,17 @@ from .body_states import BodyStates
 from .contacts import ELEVATIONS, MODES, VALUES, StatusWords, find_contacts, sources_of, warn_of_contacts_left_out
 from .drives import GAINS, Drives
 from .joint_forces import JointForces
-from .layout import Layouts
-from .mass_matrix_interface import Plugs
+from .layout import StateLayouts
+from .mass_matrix_interface import MassMatrixInterface
 from .model import check_loop_joints, from_newton
 from .model_arrays import ModelArrays
 from .model_contacts import ModelContacts
-from .observables import Observables, Reports
+from .observables import ObservableArrays, Observables
 from .pairs import ModelPairs, find_pairs, warn_of_bodies_apart
 from .resets import reset_state
-from .slots import VARIABLE as SLOT_VALUES
-from .slots import Slots
+from .slots import SLOT_VALUES, ContactSlots
 from .tape import StepGradients, paused_tape, refuse_tape
-from .worlds import Worlds
+from .worlds import WorldRows
 
 DEFAULT_VARIABLE = (
     "body_mass",
@@ -50,7 +48,7 @@ DEFAULT_VARIABLE = (
 )
 
 
-class SolverSPO(Plugs, SolverBase):
+class SolverSPO(MassMatrixInterface, SolverBase):
     """A Newton solver for articulations in reduced coordinates, implicit in all forces of the joints.
 
     These forces are damping, springs, drives with their effort limits, position limits, dry friction and velocity
@@ -134,7 +132,7 @@ class SolverSPO(Plugs, SolverBase):
     """
 
     Observables = Observables
-    SUPPORTED_OBSERVABLES: ClassVar[frozenset[str]] = Reports.SUPPORTED
+    SUPPORTED_OBSERVABLES: ClassVar[frozenset[str]] = ObservableArrays.SUPPORTED
 
     def __init__(
         self,
@@ -183,13 +181,13 @@ class SolverSPO(Plugs, SolverBase):
             raise UnsupportedError(
                 "SolverSPO", f"mimic joints: {names}", "loops='embed' closes them, loops='cut' leaves them open"
             )
-        worlds, heights = Worlds(model), ELEVATIONS in self._asked
+        worlds, heights = WorldRows(model), ELEVATIONS in self._asked
         touching, pairs = self._contacts_of(worlds, scene)
         self._drives = Drives(model, scene)
         scene = scene if touching is None else touching.scene
         scene = self._drives.apply(scene if pairs is None else pairs.added_to(scene))
         variable = [name for name in self._asked if name not in GAINS or self._drives.any]
-        self._slots: Slots | None = touching if isinstance(touching, Slots) else None
+        self._slots: ContactSlots | None = touching if isinstance(touching, ContactSlots) else None
         sources = sources_of(model, worlds, touching, pairs, heights)
         if heights and ELEVATIONS not in sources:
             what = f"variable={ELEVATIONS!r} of a model whose ground is no height field that the solver computes"
@@ -202,29 +200,31 @@ class SolverSPO(Plugs, SolverBase):
             self.dynamics.tune("forward_dynamics" if self.integrator == "rk4" else "step")
         if self.dynamics.closed:
             check_loop_joints(model, worlds.loops)
-        declare(exchange, wp.float32)
+        declare(newton_arrays, wp.float32)
         self._body_rows = worlds.bodies
         self._mask_from = 0 if worlds.declared else -1  # a mask's last entry is for bodies outside worlds
-        self._layouts = state = Layouts.of(model, worlds, scene)
+        self._layouts = state = StateLayouts.of(model, worlds, scene)
         self._bodies = BodyStates(self.dynamics, state)
         self._arrays = ModelArrays(model, worlds, state, self._drives.factors, sources)
         self._words = StatusWords(model, worlds, touching, pairs)
-        self._reports = Reports(self.dynamics, state, pairs is not None, self._substeps)
+        self._observable_arrays = ObservableArrays(self.dynamics, state, pairs is not None, self._substeps)
         self._joint_forces = JointForces(self.dynamics, state)
         self._gradients = StepGradients(
             model, self.dynamics, state, self._joint_forces, self._drives, self._arrays, self._passes, self._empty_slots
         )
         self._prepare()
 
-    def _contacts_of(self, worlds: Worlds, scene: Scene) -> tuple[ModelContacts | Slots | None, ModelPairs | None]:
+    def _contacts_of(
+        self, worlds: WorldRows, scene: Scene
+    ) -> tuple[ModelContacts | ContactSlots | None, ModelPairs | None]:
         """Return the contacts with the ground that steps compute, or slots for a list of them; and pairs of bodies."""
         lacking = self._lacks_contacts(scene)
         pairs = find_pairs(self.model, worlds, scene, self._pairs_asked, lacking)
         options = (*self._contact_options, lacking, ELEVATIONS in self._asked)
         found = find_contacts(self.model, worlds, scene, pairs, *options)
-        if self._pairs_asked is None and found is not None and not isinstance(found, Slots):
+        if self._pairs_asked is None and found is not None and not isinstance(found, ContactSlots):
             warn_of_bodies_apart(self.model, worlds, scene)
-        if isinstance(found, Slots) and self._substeps > 1:
+        if isinstance(found, ContactSlots) and self._substeps > 1:
             if self._contact_options[0] == "pipeline":
                 raise UnsupportedError("SolverSPO", "contacts='pipeline' with substeps", "call step for each substep")
             warn_of_contacts_left_out(self.model, "steps with substeps take no list of contacts", 5)
@@ -264,12 +264,12 @@ class SolverSPO(Plugs, SolverBase):
         contact_slip are missing if they have none, contact_residual without pairs. Accelerations and BODY_PARENT_F are
         missing with substeps.
         """
-        return self._reports.supported
+        return self._observable_arrays.supported
 
     def observables(self, kinds: Iterable[str], **options: Any) -> Any:
         """Return arrays for observables, see ``newton.solvers.SolverBase.observables``."""
         found = super().observables(kinds, **options)
-        self._reports.allocate(found)
+        self._observable_arrays.allocate(found)
         return found
 
     @property
@@ -349,7 +349,9 @@ class SolverSPO(Plugs, SolverBase):
         body_f = None if state_in.body_f is None else at.wrenches.read(state_in.body_f, "body_f")
         tau = self._joint_forces.read(control.joint_f, q, self._arrays.used["joint_X_p"])
         given: dict[str, Any] = dict(tau=tau, body_f=body_f, **self._drives.targets(control, at.q, at.qd))
-        options = StepOptions(self.integrator, self._substeps, self._passes if self._reports.of_contacts else None)
+        options = StepOptions(
+            self.integrator, self._substeps, self._passes if self._observable_arrays.of_contacts else None
+        )
         dt = dt / self._substeps if self._substeps > 1 else dt
         if self._slots is not None:
             if state_in.body_q is None:
@@ -361,7 +363,7 @@ class SolverSPO(Plugs, SolverBase):
         if observables is None or not observables.kinds:
             q_out, qd_out = at.q.target(state_out.joint_q, "q_out"), at.qd.target(state_out.joint_qd, "qd_out")
             if qdd is not None:  # the kernel of steps with observables
-                given["status"] = self._reports.status
+                given["status"] = self._observable_arrays.status
             poses = velocities = None
             if contacts is None:  # which are marked by the poses before the step
                 bodies = self._bodies.targets(state_out)
@@ -373,15 +375,15 @@ class SolverSPO(Plugs, SolverBase):
         else:  # observables are computed from the state before the step, which state_out must not overwrite yet
             q_out, qd_out = at.q.buffer("q_out"), at.qd.buffer("qd_out")
             qdd = at.qd.buffer("qdd") if qdd is None else qdd
-            status = self._reports.status if observables.status is None else observables.status
-            report = StepReport(qdd=qdd, **self._reports.contact_arguments(observables))
+            status = self._observable_arrays.status if observables.status is None else observables.status
+            report = StepReport(qdd=qdd, **self._observable_arrays.contact_arguments(observables))
             self.dynamics.step(
                 q, qd, dt=dt, options=options, status=status, report=report, out=(q_out, qd_out), **given
             )
             if contacts is not None:
                 self._words.mark(contacts, status, state_in.body_q)
             self._words.keep(status)
-            self._reports.write(observables, q, qd, qdd, body_f)
+            self._observable_arrays.write(observables, q, qd, qdd, body_f)
         if state_out is not state_in and not at.q.plain:  # entries of loop joints keep their values
             for name in ("joint_q", "joint_qd"):
                 wp.copy(getattr(state_out, name), getattr(state_in, name))

@@ -23,7 +23,7 @@ from ..dynamics.stepping.step import STEP
 from ..errors import UnsupportedError
 from .drives import Drives
 from .joint_forces import JointForces
-from .layout import Layouts
+from .layout import StateLayouts
 from .model_arrays import ModelArrays
 
 CALL = "SolverSPO.step in wp.Tape"
@@ -73,7 +73,7 @@ class StepGradients:
         self,
         model: newton.Model,
         dynamics: Dynamics,
-        layouts: Layouts,
+        layouts: StateLayouts,
         forces: JointForces,
         drives: Drives,
         arrays: ModelArrays,

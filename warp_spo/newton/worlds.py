@@ -23,7 +23,7 @@ ROUNDING = 1e-3  # a quaternion or axis whose length differs from 1 by less is a
 OBLIQUE = 1e-3  # cosine of the angle between two D6 axes below which they are orthogonal up to a file's digits
 
 
-class Worlds:
+class WorldRows:
     """Rows of a model's flat arrays for each world.
 
     Attributes:

@@ -15,8 +15,8 @@ import numpy as np
 
 from ..trace.scalars import Value, absolute, guarded, is_constant, quotient, reciprocal
 from ..trace.spatial import IDENTITY, ZERO, Articulated, Pose, Rigid, Vector, cross, dot, magnitude, symmetric, total
-from .model.links import Link, Placed
-from .motion import NONE, Motion, carry_acceleration, hinge_entries, hinge_motion
+from .model.links import Link, LinkPlacement
+from .motion import NONE, VelocityTerms, carry_acceleration, hinge_entries, hinge_motion
 
 LEAST = 4.0  # roundings of the terms that cancel in a pivot; a smaller pivot may be rounding alone
 SOLID = 1e-2  # least share of the carried mass, and of its own moments, at which a body's inertia bounds its pivots
@@ -47,7 +47,7 @@ class Pivot(NamedTuple):
 
 
 @dataclasses.dataclass
-class Factor:
+class LinkFactor:
     """Results of eliminating the dofs of a link.
 
     Attributes:
@@ -57,7 +57,7 @@ class Factor:
         turned: the hinge's dofs are eliminated in the link's axes, not in the hinge's.
         in_hinge: the same pivots in the hinge's axes, where their columns are unit vectors; None where they are not
             computed there.
-        nothing: zero, or NaN where the link moves no inertia and has no armature; added to the world's results.
+        lost_pivot: zero, or NaN where the link moves no inertia and has no armature; added to the world's results.
     """
 
     pivots: list[Pivot]
@@ -65,17 +65,17 @@ class Factor:
     in_parent: Articulated
     whole: bool
     turned: bool
-    nothing: Value
+    lost_pivot: Value
     in_hinge: list[Pivot] | None = None
 
 
 def factor(
     link: Link,
-    place: Placed,
+    place: LinkPlacement,
     carried_on: list[Articulated],
     through: list[tuple[Pose, Articulated]],
     epsilon: float,
-) -> Factor:
+) -> LinkFactor:
     """Eliminate the dofs of a link from its articulated inertia; return its factor.
 
     Args:
@@ -109,12 +109,12 @@ def factor(
             for later in range(at + 1, len(H)):
                 share = absolute(dot(H[later], pivot.U)) * pivot.inverse
                 sizes[later] = sizes[later] + cancellation(magnitude(H[later], whole_P, column), share, sizes[at])
-    nothing: Value = 0.0
+    lost_pivot: Value = 0.0
     if link.inertia is None and not link.children:  # it moves no inertia, so nobody would notice a lost pivot
-        nothing = total(zero_or_nan(pivot.D) for pivot in pivots)
-        P = P + Articulated.build(lambda i, j: nothing if i == j else 0.0)
+        lost_pivot = total(zero_or_nan(pivot.D) for pivot in pivots)
+        P = P + Articulated.build(lambda i, j: lost_pivot if i == j else 0.0)
     in_parent = NO_INERTIA if link.parent is None or whole else place.pose.articulated_to_parent(P)
-    return Factor(pivots, P, in_parent, whole, turned, nothing, in_hinge)
+    return LinkFactor(pivots, P, in_parent, whole, turned, lost_pivot, in_hinge)
 
 
 def eliminate_units(
@@ -134,7 +134,7 @@ def eliminate_units(
     return pivots, P
 
 
-def columns(link: Link, place: Placed) -> list[Vector]:
+def columns(link: Link, place: LinkPlacement) -> list[Vector]:
     """Return the columns of H*, (omega; v) in the link's axes."""
     found = []
     for dof in link.dofs:
@@ -249,7 +249,7 @@ def cancellation(coupling: Value, share: Value, size: Value) -> Value:
 
 
 def reduce_link(
-    link: Link, place: Placed, done: Factor, motion: Motion, force: Vector, tau: Any
+    link: Link, place: LinkPlacement, done: LinkFactor, motion: VelocityTerms, force: Vector, tau: Any
 ) -> tuple[list[Value], Vector]:
     """Return D^-1 eps of each pivot, and z+ in the parent's frame; ``force`` is z: (n; f) in the link's frame."""
     if done.in_hinge is not None:
@@ -280,7 +280,7 @@ def expand_pivot(pivot: Pivot, alpha: Sequence[Value], rate: Value) -> tuple[Val
     return qdd, [a + qdd if i == pivot.unit else a for i, a in enumerate(alpha)]
 
 
-def force_on_parent(link: Link, place: Placed, done: Factor, motion: Motion, z: Vector) -> Vector:
+def force_on_parent(link: Link, place: LinkPlacement, done: LinkFactor, motion: VelocityTerms, z: Vector) -> Vector:
     """Return z+ of a link with its bias added, in the parent's frame; zero at a root."""
     if link.parent is None:
         return ZERO
@@ -295,7 +295,12 @@ def force_on_parent(link: Link, place: Placed, done: Factor, motion: Motion, z: 
 
 
 def expand_link(
-    link: Link, place: Placed, done: Factor, rates: list[Value], motion: Motion, acceleration: tuple[Vector, Vector]
+    link: Link,
+    place: LinkPlacement,
+    done: LinkFactor,
+    rates: list[Value],
+    motion: VelocityTerms,
+    acceleration: tuple[Vector, Vector],
 ) -> tuple[list[Value], tuple[Vector, Vector]]:
     """Return qdd of the link's dofs and its acceleration, for D^-1 eps and the ``acceleration`` of its parent."""
     if done.in_hinge is not None:
@@ -319,7 +324,7 @@ def expand_link(
     return qdd, (w, v)
 
 
-def _reduce_root(place: Placed, pivots: list[Pivot], force: Vector, tau: Any) -> list[Value]:
+def _reduce_root(place: LinkPlacement, pivots: list[Pivot], force: Vector, tau: Any) -> list[Value]:
     """Return D^-1 eps of each pivot of a root with pivots in its hinge's axes, which leaves nothing for a parent."""
     pose, eps = Pose(None, place.turned, ZERO), []
     z = Vector((*pose.to_parent(force[:3]), *pose.to_parent(force[3:])))
@@ -330,7 +335,12 @@ def _reduce_root(place: Placed, pivots: list[Pivot], force: Vector, tau: Any) ->
 
 
 def _expand_root(
-    link: Link, place: Placed, pivots: list[Pivot], rates: list[Value], motion: Motion, base: tuple[Vector, Vector]
+    link: Link,
+    place: LinkPlacement,
+    pivots: list[Pivot],
+    rates: list[Value],
+    motion: VelocityTerms,
+    base: tuple[Vector, Vector],
 ) -> tuple[list[Value], tuple[Vector, Vector]]:
     """Return the same for a root with pivots in its hinge's axes; ``base`` is the inertial frame's acceleration."""
     pose = Pose(None, place.turned, ZERO)
@@ -345,7 +355,7 @@ def _expand_root(
     return qdd, (pose.to_child(alpha[:3]), pose.to_child(alpha[3:]))
 
 
-def gyroscopic(inertia: Rigid | None, motion: Motion) -> Vector:
+def gyroscopic(inertia: Rigid | None, motion: VelocityTerms) -> Vector:
     """Return the (n; f) of a body at omega' = 0 and a = 0: omega x J omega; omega~ omega~ h."""
     if inertia is None:
         return Vector((*ZERO, *ZERO))

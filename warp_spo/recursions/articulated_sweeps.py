@@ -10,7 +10,7 @@ from ..trace.scalars import Value, is_constant
 from ..trace.spatial import ZERO, Articulated, Pose, Vector, total
 from . import articulated
 from .articulated import HERE, NO_INERTIA
-from .model import shared_dofs as groups
+from .model import shared_dofs
 from .model.links import Link
 from .motion import STILL
 from .newton_euler import link_acceleration
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from .model.tracing import Trace
 
 Factors = dict[int, Any]
-"""The factor of every link by id, of :mod:`.articulated`; at the leader of a group the factor of :mod:`.groups`."""
+"""The factor of every link by id, of :mod:`.articulated`; at the leader of a group the factor of
+:mod:`.shared_dofs`."""
 NO_FORCE = Vector((*ZERO, *ZERO))
 
 
@@ -29,7 +30,7 @@ def factor_tree(trace: Trace) -> Factors:
 
 
 def factor(trace: Trace) -> tuple[Factors, list[Store]]:
-    """Return the factors of every link, by id, and the stores that send them to other pieces."""
+    """Return the factors of every link, by id, and the stores that send them to other segments."""
     done: Factors = {}
     inner: dict[int, Articulated] = {}
     stores: list[Store] = []
@@ -48,21 +49,21 @@ def eliminate(
     """Add the factor of a link to ``done``, and P+ in its parent's frame to ``inner``, after its children's."""
     trace.label(link, "P")
     carried = trace.from_children(link, "P", inner, Articulated.unpacked)
-    if id(link) in trace.dampers:
-        carried = [*carried, trace.dampers[id(link)]]
-    if link.group is not None:
+    if id(link) in trace.contact_inertia:
+        carried = [*carried, trace.contact_inertia[id(link)]]
+    if link.shared_dofs is not None:
         P = total_inertia(link, carried)
-        done[id(link)] = articulated.Factor([], P, NO_INERTIA, False, False, 0.0)
+        done[id(link)] = articulated.LinkFactor([], P, NO_INERTIA, False, False, 0.0)
         inner[id(link)] = NO_INERTIA
-        if link.closes:
-            leader = link.group.links[0]
-            own = {id(one): done[id(one)].P for one in link.group.links}
-            together = groups.factor(trace.stiffened(leader), trace.places, own, trace.epsilon)
+        if link.is_last:
+            leader = link.shared_dofs.links[0]
+            own = {id(one): done[id(one)].P for one in link.shared_dofs.links}
+            together = shared_dofs.factor(trace.with_step_armature(leader), trace.places, own, trace.epsilon)
             done[id(leader)], inner[id(link)] = together, together.in_parent
         return
     through = [inside(trace, child, done) for child in link.children if id(child) in done]
     place = trace.places[id(link)]
-    done[id(link)] = found = factor(trace.stiffened(link), place, carried, through, trace.epsilon)
+    done[id(link)] = found = factor(trace.with_step_armature(link), place, carried, through, trace.epsilon)
     inner[id(link)] = found.in_parent
 
 
@@ -76,9 +77,9 @@ def total_inertia(link: Link, carried: list[Articulated]) -> Articulated:
 
 def inside(trace: Trace, child: Link, done: dict) -> tuple[Pose, Articulated]:
     """Return what a child adds to its parent's inertia, before its dofs are eliminated in the parent's frame."""
-    if child.group is None:
+    if child.shared_dofs is None:
         return trace.places[id(child)].pose, done[id(child)].P
-    return HERE, done[id(child)].whole if child.leads else NO_INERTIA
+    return HERE, done[id(child)].whole if child.is_leader else NO_INERTIA
 
 
 def reduce(
@@ -88,7 +89,7 @@ def reduce(
 
     Args:
         tau: force of a dof. moves: links have velocities. loads: subtract the external wrenches.
-        letters: of the messages to other pieces; "P" among them sends the articulated inertias.
+        letters: of the messages to other segments; "P" among them sends the articulated inertias.
     """
     done: Factors = {}
     rates: dict[int, list[Value]] = {}
@@ -108,19 +109,21 @@ def reduce(
         if loads:
             z = z - trace.external_wrench(link)
         bias = *move.bias_w, *move.bias_v, *move.bias_l
-        trace.ahead += [*(place.pose.turn or ()), *bias, *z]  # the passes of a step share them
-        if key in trace.pushes:
-            z = z - trace.pushes[key]
+        trace.pass_invariants += [*(place.pose.turn or ()), *bias, *z]  # the passes of a step share them
+        if key in trace.contact_force:
+            z = z - trace.contact_force[key]
         for force in trace.from_children(link, letters[-1], forces, Vector):
             z = z + force
-        if link.group is None:
+        if link.shared_dofs is None:
             right = [tau(dof) for dof in link.dofs]
             rates[key], forces[key] = articulated.reduce_link(link, place, factor, move, z, right)
         else:
             waiting[key], rates[key], forces[key] = z, [], NO_FORCE
-            if link.closes:
-                leader, right = id(link.group.links[0]), [tau(dof) for dof in link.dofs]
-                rates[leader], _, forces[key] = groups.reduce(done[leader], trace.places, trace.motions, waiting, right)
+            if link.is_last:
+                leader, right = id(link.shared_dofs.links[0]), [tau(dof) for dof in link.dofs]
+                rates[leader], _, forces[key] = shared_dofs.reduce(
+                    done[leader], trace.places, trace.motions, waiting, right
+                )
         carried, force = trace.add_contacts(link, inner[key], forces[key])
         stores += trace.send_to_parent("P", link, carried.packed) if "P" in letters else []
         stores += trace.send_to_parent(letters[-1], link, force)
@@ -138,7 +141,7 @@ def expand(
 ) -> list[Store]:
     """Sweep outward: return stores of qdd in the array ``name``, for ``rates`` of :func:`reduce`.
 
-    ``alpha`` receives the acceleration of every link, by id, and of the link that a piece moves on.
+    ``alpha`` receives the acceleration of every link, by id, and of the link that a segment moves on.
     """
     alpha = {} if alpha is None else alpha
     shared: dict[int, Value] = {}  # qdd of groups
@@ -151,20 +154,20 @@ def expand(
         elif id(link.parent) in trace.own:
             above = alpha[id(link.parent)]
         else:
-            received = trace.receive(letter, trace.piece.parent)  # type: ignore[union-attr, arg-type]
+            received = trace.receive(letter, trace.segment.parent)  # type: ignore[union-attr, arg-type]
             above = alpha[id(link.parent)] = Vector(received[:3]), Vector(received[3:])
         place, move = trace.places[key], trace.motions[key]
-        if link.group is None:
+        if link.shared_dofs is None:
             qdd, alpha[key] = articulated.expand_link(link, place, done[key], rates[key], move, above)
         else:
-            qdd = groups.expand(done[key], rates[key], above)[0] if link.leads else []
+            qdd = shared_dofs.expand(done[key], rates[key], above)[0] if link.is_leader else []
             shared |= zip(link.dofs, qdd, strict=False)
             alpha[key] = link_acceleration(link, place, move, above, shared.__getitem__)
-            if not link.leads:
+            if not link.is_leader:
                 continue
         stores += [Store(name, (dof,), value) for dof, value in zip(link.dofs, qdd, strict=True)]
-        if trace.piece is not None and trace.piece.children and link is trace.piece.links[-1]:
-            stores += trace.send(letter, trace.piece, (*alpha[key][0], *alpha[key][1]))
+        if trace.segment is not None and trace.segment.children and link is trace.segment.links[-1]:
+            stores += trace.send(letter, trace.segment, (*alpha[key][0], *alpha[key][1]))
     return stores
 
 
@@ -175,19 +178,19 @@ def propagate_inward(
     rates, over = {}, link
     while True:
         key = id(over)
-        if over.group is None:
+        if over.shared_dofs is None:
             rates[key], force = articulated.reduce_link(over, trace.places[key], done[key], STILL, force, right)
         else:
-            leader = id(over.group.links[0])
-            rates[leader], _, force = groups.reduce(done[leader], trace.places, {}, {key: force}, right)
+            leader = id(over.shared_dofs.links[0])
+            rates[leader], _, force = shared_dofs.reduce(done[leader], trace.places, {}, {key: force}, right)
         if over.parent is None:
             return rates
         over = over.parent
         right = [0.0] * len(over.dofs)
 
 
-def weighted_products(trace: Trace, D: dict, nothing: Value, columns: dict) -> dict[tuple[int, int], Value]:
-    """Return the upper triangle of Y* D Y + nothing for columns of Y by link.
+def weighted_products(trace: Trace, D: dict, lost_pivot: Value, columns: dict) -> dict[tuple[int, int], Value]:
+    """Return the upper triangle of Y* D Y + lost_pivot for columns of Y by link.
 
     Entries of two columns without a common link are absent, unless a pivot may be lost.
     """
@@ -199,8 +202,8 @@ def weighted_products(trace: Trace, D: dict, nothing: Value, columns: dict) -> d
         for j in names[: at + 1]:
             both = [key for key in columns[j] if key in weighted]
             pairs = (pair for key in both for pair in zip(weighted[key], columns[j][key], strict=True))
-            entry = total(a * b for a, b in pairs) + nothing
-            if both or not is_constant(nothing) or nothing != 0.0:
+            entry = total(a * b for a, b in pairs) + lost_pivot
+            if both or not is_constant(lost_pivot) or lost_pivot != 0.0:
                 entries[j, i] = entry
     return entries
 
@@ -223,5 +226,5 @@ def pack(stores: list[Store]) -> list[Store]:
 def pivots(done: Factors) -> tuple[dict[int, list[Value]], Value]:
     """Return D by link; and NaN, or zero, for lost pivots that no other result would show."""
     return {key: [pivot.D for pivot in factor.pivots] for key, factor in done.items()}, total(
-        factor.nothing for factor in done.values()
+        factor.lost_pivot for factor in done.values()
     )

@@ -10,7 +10,7 @@ from ..trace.spatial import IDENTITY, ZERO, Pose, Rigid, Vector
 from .articulated import columns
 from .articulated_sweeps import mirror, pack
 from .model.links import NOTHING as NOTHING
-from .model.links import Link, Placed
+from .model.links import Link, LinkPlacement
 from .motion import hinge_entries
 
 if TYPE_CHECKING:
@@ -21,24 +21,24 @@ Force = tuple[Vector, Vector]
 
 
 def entries(
-    link: Link, places: dict[int, Placed], body: Rigid, shared: dict[int, Force]
+    link: Link, places: dict[int, LinkPlacement], body: Rigid, shared: dict[int, Force]
 ) -> dict[tuple[int, int], Value]:
     """(row, column) of Mass for the columns of a link that carries ``body`` = R, rows on the way to the root.
 
     The forces of a group's columns on its parent are added up in ``shared``, and go on from its last link.
     """
     found = own_entries(link, places[id(link)], body)
-    for (i, j), x in link.coupled.items():
+    for (i, j), x in link.coupling_inertia.items():
         found[link.dofs[i], link.dofs[j]] = found[link.dofs[i], link.dofs[j]] + x
     for column, H in zip(link.dofs, columns(link, places[id(link)]), strict=True):
         n, f = body.apply(Vector(H[:3]), Vector(H[3:]))
         over = link
-        if link.group is not None and link.parent is not None:
+        if link.shared_dofs is not None and link.parent is not None:
             n, f = places[id(link)].pose.force_to_parent(n, f)
             if column in shared:
                 n, f = shared[column][0] + n, shared[column][1] + f
             shared[column] = n, f
-            if not link.closes:
+            if not link.is_last:
                 continue
             over = link.parent
             found |= _rows(over, places, column, n, f)
@@ -49,13 +49,15 @@ def entries(
     return found
 
 
-def _rows(link: Link, places: dict[int, Placed], column: int, n: Vector, f: Vector) -> dict[tuple[int, int], Value]:
+def _rows(
+    link: Link, places: dict[int, LinkPlacement], column: int, n: Vector, f: Vector
+) -> dict[tuple[int, int], Value]:
     """Return the entries of a link's dofs in a column that puts (n; f) on the link."""
     forces = hinge_entries(link, places[id(link)], n, f)
     return {(row, column): force for row, force in zip(link.dofs, forces, strict=True)}
 
 
-def own_entries(link: Link, place: Placed, body: Rigid) -> dict[tuple[int, int], Value]:
+def own_entries(link: Link, place: LinkPlacement, body: Rigid) -> dict[tuple[int, int], Value]:
     """H R H* + Delta of the link's own dofs, upper triangle.
 
     A link that turns by a quaternion has R in the axes of its rates, where its mass is exact. R in the link's axes is

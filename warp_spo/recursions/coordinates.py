@@ -33,7 +33,7 @@ def interpolate(trace: Trace) -> list[Store]:
     """out = q0 moved along the difference to q1 for s seconds"""
     before, after, s = trace.vector("q0"), trace.vector("q1"), trace.graph.input("s", 0)
     return _coordinates(
-        trace, lambda link: link.hinge.moved(link, before, link.hinge.difference(link, before, after), s)
+        trace, lambda link: link.hinge.integrate(link, before, link.hinge.difference(link, before, after), s)
     )
 
 
@@ -53,7 +53,7 @@ def _coordinates(trace: Trace, of: Callable[[Link], list[Value]]) -> list[Store]
 def integrate_link(link: Link, q: Callable[[int], Value], rate: Callable[[int], Value], h: Value) -> list[Value]:
     """Return the link's coordinates after ``rate(dof)`` has been constant for ``h`` [s]; quaternions come out
     normalised."""
-    return link.hinge.moved(link, q, [rate(dof) for dof in link.dofs], h)
+    return link.hinge.integrate(link, q, [rate(dof) for dof in link.dofs], h)
 
 
 def rates_of_link(link: Link, q: Callable[[int], Value], rate: Callable[[int], Value]) -> list[Value]:

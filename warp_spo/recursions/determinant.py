@@ -14,7 +14,7 @@ from ..trace.emission import Store
 from ..trace.scalars import Value, ordered, sum_of_logarithms
 from ..trace.spatial import ZERO, Articulated, Matrix, Pose, Vector, dot
 from . import motion
-from .articulated import NO_INERTIA, Factor
+from .articulated import NO_INERTIA, LinkFactor
 from .articulated_sweeps import factor_tree
 from .derivatives.tangents import tangent_gradient
 
@@ -36,7 +36,7 @@ def _exchange(S: Articulated) -> Articulated:
     return Articulated(S.m, S.C.T, S.J)
 
 
-def upsilon(done: Factor, S: Articulated) -> Articulated:
+def upsilon(done: LinkFactor, S: Articulated) -> Articulated:
     """Upsilon(k) for S = Upsilon+, pivot by pivot: P+ = P - U D^-1 U*."""
     if done.whole:  # nothing of P is left in P+
         S = NO_INERTIA
@@ -73,7 +73,7 @@ def log_det_mass_matrix(trace: Trace) -> list[Store]:
 def log_det_mass_matrix_gradient(trace: Trace, scale: float = 1.0) -> list[Store]:
     """out = d log det Mass / dq, dual to qd"""
     done = factor_tree(trace)
-    if trace.links.shared or any(link.hinge.columns_vary for link in trace.links.links):
+    if trace.links.shares_dofs or any(link.hinge.columns_vary for link in trace.links.links):
         return _by_reverse(trace, done, scale)
     carried: dict[int, Articulated] = {}
     stores = []
@@ -98,7 +98,7 @@ def log_det_mass_matrix_gradient(trace: Trace, scale: float = 1.0) -> list[Store
     return stores
 
 
-def _by_reverse(trace: Trace, done: dict[int, Factor], scale: float) -> list[Store]:
+def _by_reverse(trace: Trace, done: dict[int, LinkFactor], scale: float) -> list[Store]:
     """The same as the reverse of the sweep that finds D: of hinges whose columns depend on q, too."""
     value = sum_of_logarithms(pivot.D for factor in done.values() for pivot in factor.pivots)
     inputs = [x for x in ordered([value]) if x.op == "input" and x.args[0] == "q"]

@@ -8,7 +8,7 @@ from ..trace.emission import Store
 from ..trace.spatial import ZERO, Vector, dot
 from .kinematics import link_velocities, place_all
 from .momentum import composite_inertias
-from .step.joint_laws import Impedance
+from .step.joint_laws import JointLaws
 
 if TYPE_CHECKING:
     from .model.tracing import Trace
@@ -25,7 +25,7 @@ def kinetic_energy(trace: Trace) -> list[Store]:
             twice = twice + (dot(w, n) + dot(v, f))
         for dof, armature in zip(link.dofs, link.armature, strict=True):
             twice = twice + armature * (qd(dof) * qd(dof))
-        for (i, j), x in link.coupled.items():
+        for (i, j), x in link.coupling_inertia.items():
             twice = twice + (2.0 * x) * (qd(link.dofs[i]) * qd(link.dofs[j]))
     return [Store("out", (), 0.5 * twice)]
 
@@ -41,7 +41,7 @@ def potential_energy(trace: Trace) -> list[Store]:
             body, key = bodies[id(link)], id(link)
             moment = moment + trace.axes[key] @ body.moment + (origins[key] + first) * body.mass
     springs, energy = (
-        Impedance(trace.links, 0.0, trace.vector("q"), trace.vector("qd")),
+        JointLaws(trace.links, 0.0, trace.vector("q"), trace.vector("qd")),
         -dot(trace.links.gravity, moment),
     )
     for link in trace.links.leaders:
@@ -54,9 +54,9 @@ def potential_energy(trace: Trace) -> list[Store]:
 def moment_of_ground(trace: Trace) -> Vector:
     """Return the sum of m c of the bodies that no hinge can move, in the inertial frame."""
     moment: Vector = ZERO
-    for body, seat in trace.links.seats.items():
-        if seat.link is None:
-            rigid, axes, origin = trace.links.nodes[body].rigid, seat.matrix, seat.offset
+    for body, placement in trace.links.placements.items():
+        if placement.link is None:
+            rigid, axes, origin = trace.links.nodes[body].rigid, placement.matrix, placement.offset
             if body in trace.links.flexible:  # its other pieces are links
                 _, axes, origin, _, rigid = trace.links.flexible[body]
             moment = moment + origin * rigid.mass + axes @ rigid.moment

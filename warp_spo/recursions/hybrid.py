@@ -13,11 +13,11 @@ from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant, select
 from ..trace.spatial import Articulated, Pose, Vector, dot, total
 from . import articulated, newton_euler
-from .articulated import LEAST, NO_INERTIA, Factor, Pivot
+from .articulated import LEAST, NO_INERTIA, LinkFactor, Pivot
 from .articulated_sweeps import NO_FORCE, Factors, inside, total_inertia
-from .model import shared_dofs as groups
-from .model.links import Link, Placed
-from .motion import Motion, carry_acceleration
+from .model import shared_dofs
+from .model.links import Link, LinkPlacement
+from .motion import VelocityTerms, carry_acceleration
 
 if TYPE_CHECKING:
     from .model.tracing import Trace
@@ -37,12 +37,12 @@ class Given(NamedTuple):
 
 def factor(
     link: Link,
-    place: Placed,
+    place: LinkPlacement,
     mask: list[Value],
     carried_on: list[Articulated],
     through: list[tuple[Pose, Articulated]],
     epsilon: float,
-) -> Factor:
+) -> LinkFactor:
     """As :func:`articulated.factor`, dof by dof, in the coordinates of qd; a prescribed dof's pivot has 1 / D = 0."""
     P = NO_INERTIA if link.inertia is None else link.inertia.articulated
     for other in carried_on:
@@ -67,33 +67,35 @@ def factor(
             pivot, rest = articulated.eliminate(P, column, armature, LEAST * epsilon)
         pivots.append(pivot._replace(inverse=select(held, 0.0, pivot.inverse)))
         P = Articulated.build(lambda i, j, P=P, rest=rest, held=held: select(held, P.entry(i, j), rest.entry(i, j)))
-    nothing: Value = 0.0
+    lost_pivot: Value = 0.0
     if link.inertia is None and not link.children:  # it moves no inertia, so nobody would notice a lost pivot
-        nothing = total(select(m, 0.0, articulated.zero_or_nan(p.D)) for m, p in zip(mask[::-1], pivots, strict=True))
-        P = P + Articulated.build(lambda i, j: nothing if i == j else 0.0)
+        lost_pivot = total(
+            select(m, 0.0, articulated.zero_or_nan(p.D)) for m, p in zip(mask[::-1], pivots, strict=True)
+        )
+        P = P + Articulated.build(lambda i, j: lost_pivot if i == j else 0.0)
     in_parent = NO_INERTIA if link.parent is None else place.pose.articulated_to_parent(P)
-    return Factor(pivots, P, in_parent, whole=False, turned=False, nothing=nothing)
+    return LinkFactor(pivots, P, in_parent, whole=False, turned=False, lost_pivot=lost_pivot)
 
 
 def reduce_link(
-    link: Link, place: Placed, done: Factor, motion: Motion, force: Vector, given: Given
+    link: Link, place: LinkPlacement, done: LinkFactor, motion: VelocityTerms, force: Vector, given: Given
 ) -> tuple[list[Value], list[Value], Vector]:
     """Of each pivot D^-1 (tau - H z), or qdd if it is prescribed; H z; and z+ in the parent's frame."""
-    rates, heads, z = [], [], force
+    rates, forces_at_rest, z = [], [], force
     for pivot, held, tau, qdd in zip(done.pivots, given.mask[::-1], given.tau[::-1], given.qdd[::-1], strict=True):
-        heads.append(dot(pivot.column, z))
-        rates.append(select(held, qdd, (tau - heads[-1]) * pivot.inverse))
+        forces_at_rest.append(dot(pivot.column, z))
+        rates.append(select(held, qdd, (tau - forces_at_rest[-1]) * pivot.inverse))
         z = z + pivot.U * rates[-1]
-    return rates, heads, articulated.force_on_parent(link, place, done, motion, z)
+    return rates, forces_at_rest, articulated.force_on_parent(link, place, done, motion, z)
 
 
 def expand_link(
     link: Link,
-    place: Placed,
-    done: Factor,
+    place: LinkPlacement,
+    done: LinkFactor,
     rates: list[Value],
-    heads: list[Value],
-    motion: Motion,
+    forces_at_rest: list[Value],
+    motion: VelocityTerms,
     acceleration: tuple[Vector, Vector],
     given: Given,
 ) -> tuple[list[Value], list[Value], tuple[Vector, Vector]]:
@@ -101,12 +103,12 @@ def expand_link(
     w, v = carry_acceleration(place, motion, acceleration)
     alpha = Vector((*(w + motion.bias_w), *(v + motion.bias_v)))
     qdd, tau = [], []
-    for pivot, rate, head, held, b in zip(
-        done.pivots[::-1], rates[::-1], heads[::-1], given.mask, given.tau, strict=True
+    for pivot, rate, force_at_rest, held, b in zip(
+        done.pivots[::-1], rates[::-1], forces_at_rest[::-1], given.mask, given.tau, strict=True
     ):
         along = dot(pivot.U, alpha)
         qdd.append(rate - pivot.inverse * along)
-        tau.append(select(held, along + pivot.D * qdd[-1] + head, b))
+        tau.append(select(held, along + pivot.D * qdd[-1] + force_at_rest, b))
         alpha = alpha + pivot.column * qdd[-1]
     return qdd, tau, (Vector(alpha[:3]), Vector(alpha[3:]))
 
@@ -119,7 +121,8 @@ class HybridSweeps:
         mask: constant mask by dof; None: the array "prescribed" is the mask.
 
     Attributes:
-        given: of each link, by its id, as all that follows. done: factors. rates: D^-1 (tau - H z), or qdd. heads: H z.
+        given: of each link, by its id, as all that follows. done: factors. rates: D^-1 (tau - H z), or qdd.
+            forces_at_rest: H z.
         inner, forces: P+ and z+ in the parent's frame.
         waiting: z of the links of groups. shared: qdd of groups, by dof.
     """
@@ -131,7 +134,7 @@ class HybridSweeps:
         self.given: dict[int, Given] = {}
         self.done: Factors = {}
         self.rates: dict[int, list[Value]] = {}
-        self.heads: dict[int, list[Value]] = {}
+        self.forces_at_rest: dict[int, list[Value]] = {}
         self.inner: dict[int, Articulated] = {}
         self.forces: dict[int, Vector] = {}
         self.waiting: dict[int, Vector] = {}
@@ -145,7 +148,7 @@ class HybridSweeps:
         carried = [self.inner[id(child)] for child in link.children]
         through = [inside(trace, child, self.done) for child in link.children]
         self.given[key] = known = Given(*([entry(dof) for dof in link.dofs] for entry in self.entries))
-        if link.group is not None:
+        if link.shared_dofs is not None:
             self._wait(link, total_inertia(link, carried))
             return
         if known.free:
@@ -157,7 +160,7 @@ class HybridSweeps:
         if known.free:
             self.rates[key], self.forces[key] = articulated.reduce_link(link, place, done, move, z, known.tau)
         else:
-            self.rates[key], self.heads[key], self.forces[key] = reduce_link(link, place, done, move, z, known)
+            self.rates[key], self.forces_at_rest[key], self.forces[key] = reduce_link(link, place, done, move, z, known)
 
     def _force(self, link: Link) -> Vector:
         """Return z: velocity terms less outer wrenches, and what the children hand on."""
@@ -171,40 +174,42 @@ class HybridSweeps:
         """Keep what a link of a group brings; the one that closes the group eliminates it."""
         trace, key = self.trace, id(link)
         self.inner[key], self.forces[key] = NO_INERTIA, NO_FORCE
-        self.done[key] = articulated.Factor([], P, NO_INERTIA, False, False, 0.0)
+        self.done[key] = articulated.LinkFactor([], P, NO_INERTIA, False, False, 0.0)
         self.waiting[key] = self._force(link)
-        if not link.closes:
+        if not link.is_last:
             return
-        assert link.group is not None
-        leader, known = link.group.links[0], self.given[key]
-        own = {id(one): self.done[id(one)].P for one in link.group.links}
-        together = groups.factor(leader, trace.places, own, trace.epsilon, known.mask)
+        assert link.shared_dofs is not None
+        leader, known = link.shared_dofs.links[0], self.given[key]
+        own = {id(one): self.done[id(one)].P for one in link.shared_dofs.links}
+        together = shared_dofs.factor(leader, trace.places, own, trace.epsilon, known.mask)
         self.done[id(leader)], self.inner[key] = together, together.in_parent
-        found = groups.reduce(together, trace.places, trace.motions, self.waiting, known.tau, (known.mask, known.qdd))
-        self.rates[id(leader)], self.heads[id(leader)], self.forces[key] = found
+        found = shared_dofs.reduce(
+            together, trace.places, trace.motions, self.waiting, known.tau, (known.mask, known.qdd)
+        )
+        self.rates[id(leader)], self.forces_at_rest[id(leader)], self.forces[key] = found
 
     def expand(self, link: Link, above: tuple[Vector, Vector]) -> tuple[tuple[Vector, Vector], list[Store]]:
         """Return the acceleration of a link for that of its parent, and the stores of its qdd and tau."""
         trace, key = self.trace, id(link)
         known, place, move = self.given[key], trace.places[key], trace.motions[key]
-        if link.group is not None:
-            stores = self._expand_group(link, above) if link.leads else []
+        if link.shared_dofs is not None:
+            stores = self._expand_group(link, above) if link.is_leader else []
             return newton_euler.link_acceleration(link, place, move, above, self.shared.__getitem__), stores
         if known.free:
             qdd, alpha = articulated.expand_link(link, place, self.done[key], self.rates[key], move, above)
             tau = known.tau
         else:
             qdd, tau, alpha = expand_link(
-                link, place, self.done[key], self.rates[key], self.heads[key], move, above, known
+                link, place, self.done[key], self.rates[key], self.forces_at_rest[key], move, above, known
             )
         return alpha, _stores(link, qdd, tau)
 
     def _expand_group(self, leader: Link, above: tuple[Vector, Vector]) -> list[Store]:
         """Return the stores of a group's qdd and tau."""
         key, known = id(leader), self.given[id(leader)]
-        qdd, felt = groups.expand(self.done[key], self.rates[key], above)
+        qdd, row_forces = shared_dofs.expand(self.done[key], self.rates[key], above)
         self.shared |= zip(leader.dofs, qdd, strict=True)
-        needed = (a + b for a, b in zip(felt, self.heads[key][::-1], strict=True))
+        needed = (a + b for a, b in zip(row_forces, self.forces_at_rest[key][::-1], strict=True))
         tau = [select(held, x, b) for held, x, b in zip(known.mask, needed, known.tau, strict=True)]
         return _stores(leader, qdd, tau)
 

@@ -24,7 +24,7 @@ from ..trace.spatial import IDENTITY, ZERO, Vector, dot, total
 from .kinematics import columns, place_axes
 from .model.links import Link
 from .model.tracing import EPSILON
-from .step.joint_laws import Impedance
+from .step.joint_laws import JointLaws
 
 if TYPE_CHECKING:
     from .model.tracing import Trace
@@ -43,7 +43,7 @@ def moving_links(trace: Trace, frames: tuple) -> list[Link]:
     """Return the links that move a frame, parents first."""
     found: set[int] = set()
     for body, _ in frames:
-        link = trace.links.seats[body].link
+        link = trace.links.placements[body].link
         while link is not None and id(link) not in found:
             found.add(id(link))
             link = link.parent
@@ -58,7 +58,7 @@ def inverse_kinematics_start(trace: Trace, frames: tuple) -> list[Store]:
     """
     share, given, first = trace.vector(SHARE), trace.vector(GIVEN), trace.vector(FIRST)(0)
     moving = {id(link) for link in moving_links(trace, frames)}
-    limits, stores = Impedance(trace.links, 0.0, trace.vector("q"), trace.vector("qd")), list[Store]()
+    limits, stores = JointLaws(trace.links, 0.0, trace.vector("q"), trace.vector("qd")), list[Store]()
     for link in trace.links.links:
         trace.label(link, "o")
         values = list(link.hinge.neutral)
@@ -90,7 +90,7 @@ def _start(link: Link, i: int, share: Value, low: Value | None, high: Value | No
     return _within(low + share * (high - low), low, high)
 
 
-def bounds(trace: Trace, limits: Impedance, dof: int) -> tuple[Value | None, Value | None]:
+def bounds(trace: Trace, limits: JointLaws, dof: int) -> tuple[Value | None, Value | None]:
     """Return the limits of a dof, None where it has none; in float32 rounded to the inside. Deflections are zero."""
     if dof in trace.links.scene.deflections:
         return 0.0, 0.0
@@ -124,10 +124,10 @@ def inverse_kinematics_step(trace: Trace, frames: tuple) -> list[Store]:
     errors, rows, worst = _errors(trace, frames, origins)
     step = _damped_step(trace, links, errors, rows)
     stores = [Store(ERROR, (), worst)]
-    limits = Impedance(trace.links, 0.0, trace.vector("q"), trace.vector("qd"))
+    limits = JointLaws(trace.links, 0.0, trace.vector("q"), trace.vector("qd"))
     for link in links:
         trace.label(link, "q")
-        after = link.hinge.moved(link, trace.vector("q"), [step[dof] for dof in link.dofs], 1.0)
+        after = link.hinge.integrate(link, trace.vector("q"), [step[dof] for dof in link.dofs], 1.0)
         if link.hinge.quaternion is None:
             after = [_within(x, *bounds(trace, limits, dof)) for x, dof in zip(after, link.dofs, strict=True)]
         stores += [Store(NEXT, (link.coordinate + c,), value) for c, value in enumerate(after)]
@@ -143,12 +143,12 @@ def _errors(
     rows: list[dict[int, Value]] = []
     worst: Value = 0.0
     for index, (body, pose) in enumerate(frames):
-        seat, (R, p) = trace.links.seats[body], trace.links.nodes[body].anchor
-        link = seat.link
+        placement, (R, p) = trace.links.placements[body], trace.links.nodes[body].anchor
+        link = placement.link
         trace.graph.step = f"frame {index}|e"
         wanted = [target(7 * index + c) for c in range(7)]
-        within = seat.matrix @ R.T
-        arm, within = seat.offset + within @ (Vector(pose[:3]) - p), within @ quaternion_rotation(*pose[3:])
+        within = placement.matrix @ R.T
+        arm, within = placement.offset + within @ (Vector(pose[:3]) - p), within @ quaternion_rotation(*pose[3:])
         axes, key = (IDENTITY, None) if link is None else (trace.axes[id(link)], id(link))
         position = Vector(wanted[:3]) - (origins[key] + axes @ arm)
         relative = quaternion_rotation(*wanted[3:]) @ (axes @ within).T
@@ -190,7 +190,7 @@ def _damped_step(
 
 def _free(trace: Trace, links: list[Link], errors: list[Value], rows: list[dict[int, Value]]) -> dict[int, Value]:
     """Return 1 for each dof that may take part in the step, 0 if it stands at a limit that the step would cross."""
-    limits, found = Impedance(trace.links, 0.0, trace.vector("q"), trace.vector("qd")), dict[int, Value]()
+    limits, found = JointLaws(trace.links, 0.0, trace.vector("q"), trace.vector("qd")), dict[int, Value]()
     for link in links:
         for i, dof in enumerate(link.dofs):
             trace.label(link, "l")

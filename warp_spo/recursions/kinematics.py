@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from ..hinges.quaternions import Quaternion, constant_quaternion, multiplied, turned
+from ..hinges.quaternions import Quaternion, constant_quaternion, multiply, turned
 from ..trace.emission import Store
 from ..trace.scalars import Value, constant_of
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, dot
-from .model.links import Link, Links, Placed, place_link
+from .model.links import Link, LinkPlacement, Links, place_link
 from .motion import hinge_motion
 from .newton_euler import link_acceleration
 
@@ -24,7 +24,7 @@ def relative_quaternion(link: Link, q: Any) -> Quaternion:
     return link.hinge.relative_quaternion(link, q)
 
 
-def carried_velocity(place: Placed, parent: tuple[Vector, Vector], hinge: tuple) -> tuple[Vector, Vector]:
+def carried_velocity(place: LinkPlacement, parent: tuple[Vector, Vector], hinge: tuple) -> tuple[Vector, Vector]:
     """(omega; v) of the link's frame, in its axes, for its parent's and the hinge's own."""
     w, v = place.pose.motion_to_child(*parent)
     return w + hinge[0], v + hinge[1]
@@ -35,7 +35,9 @@ def velocity(axes: Matrix, w: Any, v: Any, arm: Any) -> Vector:
     return axes @ (v + cross(w, arm))
 
 
-def columns(link: Link, place: Placed, parent_axes: Matrix, axes: Matrix, arm: Vector) -> list[tuple[Vector, Vector]]:
+def columns(
+    link: Link, place: LinkPlacement, parent_axes: Matrix, axes: Matrix, arm: Vector
+) -> list[tuple[Vector, Vector]]:
     """Return (omega; v), in inertial axes, of a point at ``arm`` from the link's origin, per unit rate of each dof.
 
     ``axes`` are the link's, ``parent_axes`` the parent link's axes in the inertial frame, ``arm`` is in the link's.
@@ -60,14 +62,14 @@ def frame_on_link(trace: Trace, body: int, origin: tuple) -> tuple[Link | None, 
     """Return the link that carries a frame of a body, and the frame's origin in the link's frame."""
     if (body, tuple(origin)) in trace.links.ports:
         return trace.links.ports[body, tuple(origin)].link, ZERO
-    seat = trace.links.seats[body]
-    return seat.link, seat.offset + arm_on_link(trace, body, origin)
+    placement = trace.links.placements[body]
+    return placement.link, placement.offset + arm_on_link(trace, body, origin)
 
 
 def arm_on_link(trace: Trace, body: int, origin: tuple) -> Vector:
     """Return the way from a body's node frame to the origin of a frame of the body, in the axes of its link."""
     R, p = trace.links.nodes[body].anchor
-    return trace.links.seats[body].matrix @ (R.T @ (Vector(origin) - p))
+    return trace.links.placements[body].matrix @ (R.T @ (Vector(origin) - p))
 
 
 def jacobian(trace: Trace, frames: tuple) -> list[Store]:
@@ -97,7 +99,7 @@ def link_poses(trace: Trace) -> tuple[dict[int | None, Vector], dict[int | None,
         over = None if link.parent is None else id(link.parent)
         trace.places[id(link)] = place = place_link(link, q)
         at[id(link)] = at[over] + turned(turns[over], place.pose.l)
-        turns[id(link)] = multiplied(turns[over], relative_quaternion(link, q))
+        turns[id(link)] = multiply(turns[over], relative_quaternion(link, q))
     return at, turns
 
 
@@ -113,15 +115,15 @@ def quaternions_in_links(links: Links) -> dict[int, Quaternion]:
     for link in links.links:
         over = None if link.parent is None else id(link.parent)
         rest = Vector(map(constant_of, link.hinge.quaternion_at_rest(link)))
-        by_links[id(link)] = multiplied(by_links[over], rest)
+        by_links[id(link)] = multiply(by_links[over], rest)
     found = {}
-    for body, seat in links.seats.items():  # parents first; all at neutral coordinates
+    for body, placement in links.placements.items():  # parents first; all at neutral coordinates
         hinge = scene.hinge_of[body]
         outer, inner = (Vector(scene.values[name][0, hinge, 3:].tolist()) for name in ("joint_X_p", "joint_X_c"))
         back = Vector((-inner[0], -inner[1], -inner[2], inner[3]))
-        by_anchors[body] = multiplied(by_anchors[scene.tree.parent[body]], multiplied(outer, back))
-        own = constant_quaternion(seat.matrix @ links.nodes[body].anchor[0].T)
-        carried = multiplied(by_links[None if seat.link is None else id(seat.link)], own)
+        by_anchors[body] = multiply(by_anchors[scene.tree.parent[body]], multiply(outer, back))
+        own = constant_quaternion(placement.matrix @ links.nodes[body].anchor[0].T)
+        carried = multiply(by_links[None if placement.link is None else id(placement.link)], own)
         found[body] = own * (-1.0 if dot(carried, by_anchors[body]) < 0.0 else 1.0)
     return found
 
@@ -129,16 +131,16 @@ def quaternions_in_links(links: Links) -> dict[int, Quaternion]:
 def body_poses(trace: Trace) -> list[Store]:
     """out [body, 7] = position, quaternion xyzw"""
     (at, turns), within = link_poses(trace), quaternions_in_links(trace.links)
-    stores, numbers = [], trace.links.numbers
+    stores, constants = [], trace.links.shared_constants
     for number, body in enumerate(trace.own_bodies):
-        seat, (R, p) = trace.links.seats[body], trace.links.nodes[body].anchor
-        key = None if seat.link is None else id(seat.link)
-        axes = seat.matrix @ R.T
-        origin, turn = seat.offset - axes @ p, within[body]
-        if numbers is not None:
-            origin, turn = (Vector(numbers.of_body(number, *each)) for each in (("origin", origin), ("turn", turn)))
+        placement, (R, p) = trace.links.placements[body], trace.links.nodes[body].anchor
+        key = None if placement.link is None else id(placement.link)
+        axes = placement.matrix @ R.T
+        origin, turn = placement.offset - axes @ p, within[body]
+        if constants is not None:
+            origin, turn = (Vector(constants.of_body(number, *each)) for each in (("origin", origin), ("turn", turn)))
         position = at[key] + turned(turns[key], origin)
-        pose = (*position, *multiplied(turns[key], turn))
+        pose = (*position, *multiply(turns[key], turn))
         stores += [Store("out", (body, c), value) for c, value in enumerate(pose)]
     return stores
 
@@ -152,8 +154,8 @@ def frame_poses(trace: Trace, frames: tuple) -> list[Store]:
         key = None if link is None else id(link)
         position = at[key] + turned(turns[key], arm)
         own = NEUTRAL if (body, tuple(pose[:3])) in trace.links.ports else of_bodies[body]
-        within = multiplied(own, Vector(pose[3:]))
-        values = (*position, *multiplied(turns[key], within))
+        within = multiply(own, Vector(pose[3:]))
+        values = (*position, *multiply(turns[key], within))
         stores += [Store("out", (index, c), value) for c, value in enumerate(values)]
     return stores
 

@@ -1,8 +1,8 @@
-"""All of Mass^-1 = Y* D Y, Y = D^-1 [I - H psi K] (eq. 1), a few operations an entry, piece by piece.
+"""All of Mass^-1 = Y* D Y, Y = D^-1 [I - H psi K] (eq. 1), a few operations an entry, segment by segment.
 
-Inward, a unit force at dof j gives the rates Y_j in its piece and a force F_j on the link that the piece is mounted on.
-The rates further in are linear in the six numbers of F_j: outward, a piece receives them as a matrix N, with which its
-columns of Y are complete. The product of two columns is a sum over the pivots that both branches share.
+Inward, a unit force at dof j gives the rates Y_j in its segment and a force F_j on the link that the segment is mounted
+on. The rates further in are linear in the six numbers of F_j: outward, a segment receives them as a matrix N, with
+which its columns of Y are complete. The product of two columns is a sum over the pivots that both branches share.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from ..trace.spatial import Vector, dot, total
 from . import articulated
 from .articulated_sweeps import NO_FORCE, factor, factor_tree, mirror, pack, pivots, propagate_inward, weighted_products
 from .model.links import Link
-from .model.segments import Piece, Pieces
+from .model.segments import Segment, Segments
 from .motion import STILL
 
 if TYPE_CHECKING:
@@ -23,38 +23,39 @@ if TYPE_CHECKING:
 
 
 class Inverse:
-    """The entries of Mass^-1 that the pieces of a :class:`.tracing.Trace` work out.
+    """The entries of Mass^-1 that the segments of a :class:`.tracing.Trace` work out.
 
-    Columns of Y are lists over the pivots from the root out to the end of a piece; it has one pivot for each dof.
+    Columns of Y are lists over the pivots from the root out to the end of a segment; it has one pivot for each dof.
 
     Attributes:
         entries: by (row, column), one triangle.
-        rounds: the entries that the trace's own piece shares with others, for one dof of another piece at a time.
-        stores: messages. news: messages to the pieces that share entries with this one.
+        shared_entries: the entries that the trace's own segment shares with others, for one dof of another segment at a
+            time.
+        stores: messages. final_messages: messages to the segments that share entries with this one.
     """
 
     def __init__(self, trace: Trace):
-        self.trace, self.pieces = trace, Pieces(trace.links).pieces
+        self.trace, self.segments = trace, Segments(trace.links).all
         self.entries: dict[tuple[int, int], Value] = {}
-        self.rounds: list[dict[tuple[int, int], Value]] = []
+        self.shared_entries: list[dict[tuple[int, int], Value]] = []
         self.done, self.stores = factor(trace)
-        self.news: list[Store] = []
-        self._rates: dict[int, list[Value]] = {}  # the part of Y_j in j's own piece
+        self.final_messages: list[Store] = []
+        self._rates: dict[int, list[Value]] = {}  # the part of Y_j in j's own segment
         self._forces: dict[int, Vector] = {}  # F_j
         self._columns: dict[int, list[Value]] = {}  # Y_j
-        own = [piece for piece in self.pieces if trace.piece is None or piece.index == trace.piece.index]
-        for piece in own:
-            for at, link in enumerate(piece.links):
+        own = [segment for segment in self.segments if trace.segment is None or segment.index == trace.segment.index]
+        for segment in own:
+            for at, link in enumerate(segment.links):
                 for i, dof in enumerate(link.dofs):
                     trace.graph.step = f"column {dof}|y"
                     unit = [1.0 if j == i else 0.0 for j in range(len(link.dofs))]
-                    self._rates[dof], self._forces[dof] = self._inward(piece.links[: at + 1], NO_FORCE, unit)
-        for piece in own:
-            self._come_back(piece)
-        for piece in own:
-            for other in self.pieces:
-                if other in piece.ancestors or piece.looks_at(other):
-                    self._meet(piece, other)
+                    self._rates[dof], self._forces[dof] = self._inward(segment.links[: at + 1], NO_FORCE, unit)
+        for segment in own:
+            self._come_back(segment)
+        for segment in own:
+            for other in self.segments:
+                if other in segment.ancestors or segment.computes_shared_entries_with(other):
+                    self._meet(segment, other)
 
     def _inward(self, links: list[Link], force: Vector, right: list[Value]) -> tuple[list[Value], Vector]:
         """Return the rates for a ``force`` on the last link and ``right`` at its dofs, and the force further in."""
@@ -67,49 +68,49 @@ class Inverse:
             right = [0.0] * (0 if inner is None else len(inner.dofs))
         return rates, NO_FORCE if links[0].parent is None else force
 
-    def _come_back(self, piece: Piece) -> None:
-        """Complete the columns of a piece and multiply them with each other."""
+    def _come_back(self, segment: Segment) -> None:
+        """Complete the columns of a segment and multiply them with each other."""
         trace = self.trace
-        further = [one for one in reversed(piece.ancestors)]
-        N = [] if piece.parent is None else _sixes(trace.receive("N", piece.parent))
+        further = [one for one in reversed(segment.ancestors)]
+        N = [] if segment.parent is None else _sixes(trace.receive("N", segment.parent))
         D = [d for one in further for d in trace.receive("D", one)]
-        D += [pivot.D for link in piece.links for pivot in self.done[id(link)].pivots]
-        for j in piece.dofs:
+        D += [pivot.D for link in segment.links for pivot in self.done[id(link)].pivots]
+        for j in segment.dofs:
             trace.graph.step = f"column {j}|y"
             self._columns[j] = [dot(row, self._forces[j]) for row in N] + self._rates[j]
-        if any(other.looks_at(piece) for other in self.pieces):
-            heads = (self._columns[j][: len(N)] for j in piece.dofs)
-            self.news += trace.send("Y", piece, [x for head in heads for x in head])
-        weighted = {j: [d * y for d, y in zip(D, self._columns[j], strict=False)] for j in piece.dofs}
-        for at, j in enumerate(piece.dofs):
+        if any(other.computes_shared_entries_with(segment) for other in self.segments):
+            heads = (self._columns[j][: len(N)] for j in segment.dofs)
+            self.final_messages += trace.send("Y", segment, [x for head in heads for x in head])
+        weighted = {j: [d * y for d, y in zip(D, self._columns[j], strict=False)] for j in segment.dofs}
+        for at, j in enumerate(segment.dofs):
             trace.graph.step = f"column {j}|m"
-            for i in piece.dofs[: at + 1]:
+            for i in segment.dofs[: at + 1]:
                 self.entries[i, j] = _meeting(weighted[i], self._columns[j])
-        if not piece.children:
+        if not segment.children:
             return
-        trace.label(piece.links[-1], "n")
-        still = [0.0] * len(piece.links[-1].dofs)
+        trace.label(segment.links[-1], "n")
+        still = [0.0] * len(segment.links[-1].dofs)
         columns = []
         for c in range(6):
-            rates, force = self._inward(piece.links, Vector(float(i == c) for i in range(6)), still)
+            rates, force = self._inward(segment.links, Vector(float(i == c) for i in range(6)), still)
             columns.append([dot(row, force) for row in N] + rates)
-        self.stores += trace.send("N", piece, [x for row in zip(*columns, strict=True) for x in row])
-        self.stores += trace.send("D", piece, D[len(N) :])
-        rest = {j: [0.0] * (len(D) - len(self._columns[j])) for j in piece.dofs}
-        self.stores += trace.send("V", piece, [x for j in piece.dofs for x in self._columns[j] + rest[j]])
+        self.stores += trace.send("N", segment, [x for row in zip(*columns, strict=True) for x in row])
+        self.stores += trace.send("D", segment, D[len(N) :])
+        rest = {j: [0.0] * (len(D) - len(self._columns[j])) for j in segment.dofs}
+        self.stores += trace.send("V", segment, [x for j in segment.dofs for x in self._columns[j] + rest[j]])
 
-    def _meet(self, piece: Piece, other: Piece) -> None:
+    def _meet(self, segment: Segment, other: Segment) -> None:
         """Compute the entries of two branches, or of a branch and one that carries it, over shared pivots."""
-        fork = piece.fork(other)
-        assert fork is not None
-        common = len(fork.all_dofs)
-        D = [d for one in reversed([fork, *fork.ancestors]) for d in self.trace.receive("D", one)]
-        sent = self.trace.receive("V" if fork is other else "Y", other)
-        length = len(sent) // other.weight
+        common_ancestor = segment.common_ancestor(other)
+        assert common_ancestor is not None
+        common = len(common_ancestor.all_dofs)
+        D = [d for one in reversed([common_ancestor, *common_ancestor.ancestors]) for d in self.trace.receive("D", one)]
+        sent = self.trace.receive("V" if common_ancestor is other else "Y", other)
+        length = len(sent) // other.dof_count
         for at, i in enumerate(other.dofs):
             self.trace.graph.step = f"column {i}|m"
             theirs = [d * y for d, y in zip(D, sent[length * at : length * at + common], strict=True)]
-            self.rounds.append({(i, j): _meeting(theirs, self._columns[j]) for j in piece.dofs})
+            self.shared_entries.append({(i, j): _meeting(theirs, self._columns[j]) for j in segment.dofs})
 
 
 def _meeting(first: list[Value], second: list[Value]) -> Value:
@@ -123,13 +124,13 @@ def _sixes(values: list[Value]) -> list[list[Value]]:
 
 def mass_matrix_inverse(trace: Trace) -> list[Store]:
     """out = Mass^-1, both triangles"""
-    if trace.links.shared:
+    if trace.links.shares_dofs:
         return by_columns(trace)
     inverse = Inverse(trace)
-    rounds = [mirror(entries) for entries in inverse.rounds]
-    if trace.piece is not None:
-        trace.rounds, trace.news, rounds = rounds, inverse.news, []
-    return inverse.stores + mirror(inverse.entries) + [item for stores in rounds for item in stores]
+    shared_entries = [mirror(entries) for entries in inverse.shared_entries]
+    if trace.segment is not None:
+        trace.final_stores, trace.final_messages, shared_entries = shared_entries, inverse.final_messages, []
+    return inverse.stores + mirror(inverse.entries) + [item for stores in shared_entries for item in stores]
 
 
 def by_columns(trace: Trace) -> list[Store]:

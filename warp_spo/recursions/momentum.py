@@ -85,7 +85,7 @@ def com_jacobian(trace: Trace) -> list[Store]:
         trace.label(link, "j")
         for dof, (_, f) in zip(link.dofs, momenta(trace, link, bodies[id(link)]), strict=True):
             stores += [Store("out", (c, dof), value * inverse) for c, value in enumerate(f)]
-    return merge(stores) if trace.links.shared else stores
+    return merge(stores) if trace.links.shares_dofs else stores
 
 
 def centroidal_momentum_matrix(trace: Trace) -> list[Store]:
@@ -98,7 +98,7 @@ def centroidal_momentum_matrix(trace: Trace) -> list[Store]:
         arm = origins[id(link)] - c
         for dof, (n, f) in zip(link.dofs, momenta(trace, link, bodies[id(link)]), strict=True):
             stores += [Store("out", (i, dof), value) for i, value in enumerate((*f, *(n + cross(arm, f))))]
-    return merge(stores) if trace.links.shared else stores
+    return merge(stores) if trace.links.shares_dofs else stores
 
 
 def centroidal_momentum_bias(trace: Trace, qdd: Callable[[int], Value] = zero) -> list[Store]:

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Rigid, Vector, cross, skew
-from .model.links import Link, Placed
-from .motion import Motion, armature_forces, carry_acceleration, hinge_entries, hinge_motion
+from .model.links import Link, LinkPlacement
+from .motion import VelocityTerms, armature_forces, carry_acceleration, hinge_entries, hinge_motion
 
 if TYPE_CHECKING:
     from .model.tracing import Trace
 
 
 def link_acceleration(
-    link: Link, place: Placed, motion: Motion, acceleration: tuple[Vector, Vector], qdd: Any
+    link: Link, place: LinkPlacement, motion: VelocityTerms, acceleration: tuple[Vector, Vector], qdd: Any
 ) -> tuple[Vector, Vector]:
     """Return the acceleration of the link for that of its parent and ``qdd(dof)``."""
     if link.hinge.unconstrained and link.parent is None:
@@ -35,7 +35,7 @@ def root_acceleration(link: Link, base: tuple[Vector, Vector], qdd: Any) -> tupl
     return back @ base[0] + Vector(rates[3:]), back @ base[1] + Vector(rates[:3])
 
 
-def body_force(inertia: Rigid, motion: Motion, w: Vector, v: Vector) -> Vector:
+def body_force(inertia: Rigid, motion: VelocityTerms, w: Vector, v: Vector) -> Vector:
     """Return the (n; f) that gives a body the classical acceleration (w; v) at its frame's origin."""
     rotation: Matrix = skew(w) + motion.whirl
     n = inertia.inertia @ w + cross(inertia.moment, v) + cross(motion.spin, inertia.inertia @ motion.spin)
@@ -72,14 +72,21 @@ def add_wrenches(axes: Matrix, acting: list[tuple[Vector, Vector, Vector]]) -> t
     return axes.T @ torque + moment, axes.T @ force
 
 
-def hinge_force(link: Link, place: Placed, n: Vector, f: Vector, qdd: Any) -> list[Value]:
+def hinge_force(link: Link, place: LinkPlacement, n: Vector, f: Vector, qdd: Any) -> list[Value]:
     """Return tau of the link's dofs for the force (n; f) that its hinge transmits."""
     forces = hinge_entries(link, place, n, f)
     return [force + own for force, own in zip(forces, armature_forces(link, qdd), strict=True)]
 
 
 def root_force(
-    link: Link, place: Placed, n: Vector, f: Vector, mass: float, v: Vector, base: tuple[Vector, Vector], qdd: Any
+    link: Link,
+    place: LinkPlacement,
+    n: Vector,
+    f: Vector,
+    mass: float,
+    v: Vector,
+    base: tuple[Vector, Vector],
+    qdd: Any,
 ) -> list[Value]:
     """The same for a free link on the inertial frame that carries ``mass``, itself included, and accelerates with v.
 
@@ -124,12 +131,12 @@ def inverse_dynamics(
             tau = hinge_force(link, trace.places[key], n, f, qdd)
         else:
             tau = root_force(link, trace.places[key], n, f, mass, alpha[key][1], base, qdd)
-        if link.group is None:
+        if link.shared_dofs is None:
             stores += [Store("out", (dof,), value) for dof, value in zip(link.dofs, tau, strict=True)]
         else:
             for dof, value in zip(link.dofs, tau, strict=True):
                 shared[dof] = shared.get(dof, 0.0) + value
-            stores += [Store("out", (dof,), shared[dof]) for dof in link.dofs if link.closes]
+            stores += [Store("out", (dof,), shared[dof]) for dof in link.dofs if link.is_last]
         if link.parent is not None:
             n, f = trace.places[key].pose.force_to_parent(n, f)
             forces[key] = Vector((*n, *f))

@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING
 
 from ..hinges.deflection import Deflection
 from ..hinges.quaternions import matrix_quaternion
-from ..hinges.rotor_axis import Spin
+from ..hinges.rotor_axis import RotorAxis
 from ..trace.emission import Store
 from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Pose, Rigid, Vector, cross, dot
 from .articulated import columns
 from .kinematics import place_all
-from .model.link import Link, Seat
+from .model.link import BodyPlacement, Link
 from .model.rotations import folded
 from .model.rotors import locked, own_link
 
@@ -61,16 +61,20 @@ def node_blocks(trace: Trace) -> list[Store]:
         diagonal = [armature[dof] for dof in sorted(armature)] + [0.0] * modes
         found["Delta"] += [a if i == j else 0.0 for i, a in enumerate(diagonal) for j in range(len(diagonal))]
         found["out"] += _beside(_rotor_inertia(rotor, size), _inertia(trace, node))
-        seat = links.seats[node]
-        axes, origin = (IDENTITY, ZERO) if seat.link is None else (trace.axes[id(seat.link)], origins[id(seat.link)])
-        at = origin + axes @ seat.offset + (ZERO if seat.link is None else first)
-        found["frames"] += [*at, *matrix_quaternion(axes @ seat.matrix)]
+        placement = links.placements[node]
+        axes, origin = (
+            (IDENTITY, ZERO)
+            if placement.link is None
+            else (trace.axes[id(placement.link)], origins[id(placement.link)])
+        )
+        at = origin + axes @ placement.offset + (ZERO if placement.link is None else first)
+        found["frames"] += [*at, *matrix_quaternion(axes @ placement.matrix)]
     return [Store(array, (i,), value) for array, values in found.items() for i, value in enumerate(values)]
 
 
 def _hinge_links(trace: Trace, node: int) -> list[Link]:
     """Return the links of a body's own hinge, inboard first."""
-    return [x for x in trace.links.links if x.node == node and not isinstance(x.hinge, Deflection | Spin)]
+    return [x for x in trace.links.links if x.node == node and not isinstance(x.hinge, Deflection | RotorAxis)]
 
 
 def _modes(trace: Trace, node: int) -> int:
@@ -98,8 +102,8 @@ def _beside(first: list[list[Value]], second: list[list[Value]]) -> list[Value]:
 
 def _at_node(trace: Trace, node: int, link: Link, column: Vector) -> Six:
     """Return a motion of a link of a body's hinge as a motion of the body's node frame."""
-    seat, path = trace.links.seats[node], list[Link]()
-    over = seat.link
+    placement, path = trace.links.placements[node], list[Link]()
+    over = placement.link
     while over is not link:
         assert over is not None
         path.append(over)
@@ -107,13 +111,13 @@ def _at_node(trace: Trace, node: int, link: Link, column: Vector) -> Six:
     w, v = Vector(column[:3]), Vector(column[3:])
     for other in reversed(path):
         w, v = trace.places[id(other)].pose.motion_to_child(w, v)
-    return [*(x for part in Pose(None, seat.matrix, seat.offset).motion_to_child(w, v) for x in part)]
+    return [*(x for part in Pose(None, placement.matrix, placement.offset).motion_to_child(w, v) for x in part)]
 
 
 def _weight(trace: Trace, parent: int, child: int) -> list[Value]:
     """Return w(parent, child), row by row."""
     links, scene = trace.links, trace.links.scene
-    seat, inner = links.seats[child], links.seats[parent]
+    placement, inner = links.placements[child], links.placements[parent]
     port, rotor = links.ports[child].link if child in links.ports else None, own_link(links, child)
     modes, spins, above = _modes(trace, child), scene.node_sizes[child] - 6, scene.node_sizes[parent] - 6
     spins, above = spins - modes, above - _modes(trace, parent)
@@ -124,8 +128,8 @@ def _weight(trace: Trace, parent: int, child: int) -> list[Value]:
     starts += [None] * modes
     for c in range(6):
         unit = _unit(c)
-        at_seat = Pose(None, seat.matrix, seat.offset).force_to_parent(Vector(unit[:3]), Vector(unit[3:]))
-        starts.append((seat.link, *at_seat))
+        at_seat = Pose(None, placement.matrix, placement.offset).force_to_parent(Vector(unit[:3]), Vector(unit[3:]))
+        starts.append((placement.link, *at_seat))
     rows: list[list[Value]] = [[] for _ in range(scene.node_sizes[parent])]
     for start in starts:
         if start is None:  # modes of the child
@@ -154,23 +158,23 @@ def _inertia(trace: Trace, node: int) -> list[list[Value]]:
     rotors that ride on it."""
     links, scene = trace.links, trace.links.scene
     riders = [(int(k), scene.hinges[scene.hinge_of[k]]) for k in scene.tree.children[node]]
-    riders = [(k, h) for k, h in riders if getattr(h.rotor, "model", "") == "reduced" and links.seats[node].link]
+    riders = [(k, h) for k, h in riders if getattr(h.rotor, "model", "") == "reduced" and links.placements[node].link]
     if node not in links.flexible:
         whole = links.nodes[node].rigid
         for child, hinge in riders:
             whole = whole + locked(hinge.rotor, *links.nodes[child].tree)
         P = whole.articulated
         return [[P.entry(i, j) for j in range(6)] for i in range(6)]
-    own, seat = links.flexible[node], links.seats[node]
+    own, placement = links.flexible[node], links.placements[node]
     n, leader = len(own.leader.dofs), own.leader
     M: list[list[Value]] = [[0.0] * (n + 6) for _ in range(n + 6)]
-    rigid = [_in_link(seat, Vector(float(i == c) for i in range(6))) for c in range(6)]
+    rigid = [_in_link(placement, Vector(float(i == c) for i in range(6))) for c in range(6)]
     ports = {id(port.link) for port in links.ports.values()}
     still = Pose(None, own.axes, own.origin)
     pieces: list[tuple[Rigid, list[Vector]]] = [
         (own.rest, [NOTHING] * n + [Vector(_flat(still.motion_to_child(*motion))) for motion in rigid])
     ]
-    for piece in leader.group.links:  # type: ignore[union-attr]
+    for piece in leader.shared_dofs.links:  # type: ignore[union-attr]
         if piece.inertia is not None and id(piece) not in ports:
             place = trace.places[id(piece)]
             moved = [Vector(_flat(place.pose.motion_to_child(*motion))) for motion in rigid]
@@ -188,15 +192,15 @@ def _inertia(trace: Trace, node: int) -> list[list[Value]]:
                 M[i][j] = M[j][i] = M[i][j] + dot(J[i], forces[j])
     for i, a in enumerate(leader.armature):
         M[i][i] = M[i][i] + a
-    for (i, j), x in leader.coupled.items():
+    for (i, j), x in leader.coupling_inertia.items():
         M[i][j] = M[j][i] = M[i][j] + x
     return M
 
 
-def _in_link(seat: Seat, motion: Vector) -> tuple[Vector, Vector]:
+def _in_link(placement: BodyPlacement, motion: Vector) -> tuple[Vector, Vector]:
     """Return a motion of a node frame as one of the frame of the link that it sits on."""
-    w, v = seat.matrix @ Vector(motion[:3]), seat.matrix @ Vector(motion[3:])
-    return w, v + cross(seat.offset, w)
+    w, v = placement.matrix @ Vector(motion[:3]), placement.matrix @ Vector(motion[3:])
+    return w, v + cross(placement.offset, w)
 
 
 def _flat(twist: tuple[Vector, Vector]) -> Six:

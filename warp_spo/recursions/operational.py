@@ -11,7 +11,7 @@ from ..trace.spatial import ZERO, Vector, cross
 from . import articulated
 from .articulated_sweeps import NO_FORCE, factor_tree, mirror, pivots, propagate_inward, weighted_products
 from .kinematics import accelerations_of_frames, frame_on_link, place_all, place_axes
-from .model import shared_dofs as groups
+from .model import shared_dofs
 from .model.links import Link
 from .motion import STILL
 from .newton_euler import link_acceleration
@@ -65,10 +65,10 @@ def respond(
     for link in reversed(trace.links.links):
         trace.label(link, "z")
         key, still = id(link), [0.0] * len(link.dofs)
-        if link.group is None:
+        if link.shared_dofs is None:
             rates[key], force = articulated.reduce_link(link, trace.places[key], done[key], STILL, forces[key], still)
-        elif link.leads:
-            rates[key], _, force = groups.reduce(done[key], trace.places, {}, forces, still)
+        elif link.is_leader:
+            rates[key], _, force = shared_dofs.reduce(done[key], trace.places, {}, forces, still)
         else:
             continue
         if link.parent is not None:
@@ -79,12 +79,12 @@ def respond(
         trace.label(link, "a")
         above = (ZERO, ZERO) if link.parent is None else alpha[id(link.parent)]
         place = trace.places[id(link)]
-        if link.group is None:
+        if link.shared_dofs is None:
             own, alpha[id(link)] = articulated.expand_link(link, place, done[id(link)], rates[id(link)], STILL, above)
             qdd |= zip(link.dofs, own, strict=True)
             continue
-        if link.leads:
-            qdd |= zip(link.dofs, groups.expand(done[id(link)], rates[id(link)], above)[0], strict=True)
+        if link.is_leader:
+            qdd |= zip(link.dofs, shared_dofs.expand(done[id(link)], rates[id(link)], above)[0], strict=True)
         alpha[id(link)] = link_acceleration(link, place, STILL, above, qdd.__getitem__)
     return qdd, alpha
 

@@ -15,7 +15,7 @@ from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Articulated, Pose, Vector, cross, dot
 from . import articulated
 from .expressions import NODES, Expression, spaces
-from .model.links import Link, Placed, place_link
+from .model.links import Link, LinkPlacement, place_link
 from .motion import hinge_entries, hinge_motion
 
 if TYPE_CHECKING:
@@ -36,8 +36,8 @@ class Operators:
         for link in self.links.links:
             self.chains[link.node].append(link)
         self._hops: dict[int, list[tuple[Link | None, Pose]]] = {}
-        self._places: dict[int, Placed] = {}
-        self._factors: dict[int, articulated.Factor] = {}
+        self._places: dict[int, LinkPlacement] = {}
+        self._factors: dict[int, articulated.LinkFactor] = {}
         self._inertias: dict[int, Articulated] = {}
 
     def stores(self, expression: Expression) -> list[Store]:
@@ -350,7 +350,7 @@ class Operators:
         return self._inertias[top]
 
     # -- what is shared --------------------------------------------------------------------------------------------
-    def place(self, link: Link) -> Placed:
+    def place(self, link: Link) -> LinkPlacement:
         """Return the placement of a link."""
         if id(link) not in self._places:
             self.graph.step = f"{link.title}|x"
@@ -358,16 +358,19 @@ class Operators:
         return self._places[id(link)]
 
     def hops(self, node: int) -> list[tuple[Link | None, Pose]]:
-        """Return the poses from the parent's node frame to the node's: along the hinge's links, then to the seat."""
+        """Return the poses from the parent's node frame to the node's: along the hinge's links, then to the body's
+        placement."""
         if node not in self._hops:
-            chain, seat = self.chains[node], self.links.seats[node]
+            chain, placement = self.chains[node], self.links.placements[node]
             found: list[tuple[Link | None, Pose]] = []
             if chain:
                 self.graph.step = f"{chain[0].title}|x"
                 found.append((chain[0], place_link(self.links.on_parent_node(chain[0]), self.q).pose))
                 found += [(link, self.place(link).pose) for link in chain[1:]]
-                if seat.matrix != IDENTITY or not seat.offset.vanishes:
-                    found.append((None, Pose(None, None if seat.matrix == IDENTITY else seat.matrix, seat.offset)))
+                if placement.matrix != IDENTITY or not placement.offset.vanishes:
+                    found.append(
+                        (None, Pose(None, None if placement.matrix == IDENTITY else placement.matrix, placement.offset))
+                    )
             else:
                 matrix, offset = self.links.nodes[node].tree
                 found.append((None, Pose(None, None if matrix == IDENTITY else matrix, offset)))
@@ -380,7 +383,7 @@ class Operators:
             return []
         return [(link, pose, link is self.chains[node][0]) for link, pose in reversed(self.hops(node))]
 
-    def factor(self, top: Link) -> articulated.Factor:
+    def factor(self, top: Link) -> articulated.LinkFactor:
         """Return the factor of a link; see :func:`warp_spo.recursions.articulated.factor`."""
         below, stack = [], [top]
         while stack:

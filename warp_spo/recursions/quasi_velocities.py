@@ -16,11 +16,11 @@ from ..trace.spatial import ZERO, Articulated, Vector, dot, total
 from . import articulated, hybrid
 from .articulated_sweeps import Factors, eliminate
 from .derivatives.tangents import coordinate_directions
-from .model import shared_dofs as groups
+from .model import shared_dofs
 from .motion import carry_acceleration, link_motion
 
 if TYPE_CHECKING:
-    from .model.links import Link, Placed
+    from .model.links import Link, LinkPlacement
     from .model.tracing import Trace
 
 Entry = Callable[[int], Value]
@@ -38,7 +38,7 @@ def factor_by_dofs(trace: Trace) -> Factors:
     return done
 
 
-def _factor(link: Link, place: Placed, *carried: Any) -> articulated.Factor:
+def _factor(link: Link, place: LinkPlacement, *carried: Any) -> articulated.LinkFactor:
     return hybrid.factor(link, place, [0.0] * len(link.dofs), *carried)
 
 
@@ -74,7 +74,7 @@ def _scale(trace: Trace, done: Factors, qd: Entry) -> dict[int, Value]:
     for link in trace.links.links:
         trace.label(link, "v")
         V = _carry(trace, link, velocity)
-        if link.group is not None:
+        if link.shared_dofs is not None:
             for dof, pivot in zip(link.dofs, done[id(link)].pivots[::-1], strict=False):
                 nu[dof] = sqrt(pivot.D) * (qd(dof) + pivot.inverse * _apply_to_pivot(trace, link, pivot, velocity, qd))
             velocity[id(link)] = _add_group_rates(done, link, V, qd)
@@ -87,7 +87,9 @@ def _scale(trace: Trace, done: Factors, qd: Entry) -> dict[int, Value]:
     return nu
 
 
-def _apply_to_pivot(trace: Trace, link: Link, pivot: groups.Pivot, velocity: dict[int, Vector], qd: Entry) -> Value:
+def _apply_to_pivot(
+    trace: Trace, link: Link, pivot: shared_dofs.SharedPivot, velocity: dict[int, Vector], qd: Entry
+) -> Value:
     """Return U* V(p) of a group's pivot, and what the rates before it add."""
     above = Vector((*ZERO, *ZERO)) if link.parent is None else velocity[id(link.parent)]
     return dot(pivot.U, above) + total(x * qd(link.dofs[i]) for i, x in enumerate(pivot.row))
@@ -95,7 +97,7 @@ def _apply_to_pivot(trace: Trace, link: Link, pivot: groups.Pivot, velocity: dic
 
 def _add_group_rates(done: Factors, link: Link, V: Vector, qd: Entry) -> Vector:
     """Return V and the velocities that the rates of a group give one of its links."""
-    for dof, column in zip(link.dofs, done[id(link.group.links[0])].columns[id(link)], strict=True):  # type: ignore[union-attr]
+    for dof, column in zip(link.dofs, done[id(link.shared_dofs.links[0])].columns[id(link)], strict=True):  # type: ignore[union-attr]
         V = V + column * qd(dof)
     return V
 
@@ -107,7 +109,7 @@ def _unscale(trace: Trace, done: Factors, nu: Entry) -> dict[int, Value]:
     for link in trace.links.links:
         trace.label(link, "v")
         V = _carry(trace, link, velocity)
-        if link.group is not None:
+        if link.shared_dofs is not None:
             for dof, pivot in zip(link.dofs, done[id(link)].pivots[::-1], strict=False):
                 known = _apply_to_pivot(trace, link, pivot, velocity, qd.__getitem__)
                 qd[dof] = pivot.inverse * (sqrt(pivot.D) * nu(dof) - known)
@@ -153,11 +155,11 @@ def _accelerate(trace: Trace, done: Factors, tau: Entry, base: tuple[Vector, Vec
         for child in link.children:
             z = z + forces[id(child)]
         rates[key] = []
-        if link.group is not None:
+        if link.shared_dofs is not None:
             waiting[key], forces[key] = z, Vector((*ZERO, *ZERO))
-            if link.leads:  # which comes last
+            if link.is_leader:  # which comes last
                 right = [tau(dof) for dof in link.dofs]
-                rates[key], _, forces[key] = groups.reduce(done[key], trace.places, trace.motions, waiting, right)
+                rates[key], _, forces[key] = shared_dofs.reduce(done[key], trace.places, trace.motions, waiting, right)
             continue
         for pivot, dof in zip(done[key].pivots, link.dofs[::-1], strict=True):
             rate, z = articulated.reduce_pivot(pivot, z, tau(dof))
@@ -171,7 +173,7 @@ def _accelerate(trace: Trace, done: Factors, tau: Entry, base: tuple[Vector, Vec
         above = base if link.parent is None else alpha[id(link.parent)]
         w, v = carry_acceleration(trace.places[key], move, above)
         alpha[key] = w, v = w + move.bias_w, v + move.bias_v
-        if link.group is not None:
+        if link.shared_dofs is not None:
             for dof, pivot, rate in zip(link.dofs, done[key].pivots[::-1], rates[key][::-1], strict=False):
                 found[dof] = sqrt(pivot.D) * (rate - pivot.inverse * dot(pivot.U, (*above[0], *above[1])))
             continue

@@ -18,7 +18,7 @@ def body_accelerations(trace: Trace) -> list[Store]:
     """out [body, 6] = acceleration of the CoM, angular acceleration"""
     _, alpha = _moving(trace)
     stores = []
-    for body in trace.links.seats:
+    for body in trace.links.placements:
         link, com = trace.links.center(body)
         if link is None:
             continue
@@ -36,20 +36,20 @@ def body_reactions(trace: Trace) -> list[Store]:
     The wrench on a body accelerates it and is passed on to its children; moments are about CoMs.
     """
     origins, alpha = _moving(trace)
-    tree, seats, stores = trace.links.scene.tree, trace.links.seats, []
+    tree, placements, stores = trace.links.scene.tree, trace.links.placements, []
     still = -trace.places[id(trace.links.links[0])].pose.l  # the inertial frame's origin, seen from the first link's
     forces: dict[int, tuple[Vector, Vector]] = {}
     places: dict[int, Vector] = {}
-    for body in reversed(list(seats)):  # parents come first there
-        seat = seats[body]
+    for body in reversed(list(placements)):  # parents come first there
+        placement = placements[body]
         move, R, origin = STILL, IDENTITY, still
         w, v = trace.base_acceleration
-        if seat.link is not None:
-            key = id(seat.link)
-            trace.label(seat.link, "f")
+        if placement.link is not None:
+            key = id(placement.link)
+            trace.label(placement.link, "f")
             (w, v), move, R, origin = alpha[key], trace.motions[key], trace.axes[key], origins[key]
-        com = seat.offset + seat.matrix @ trace.links.nodes[body].com
-        place = Pose(None, seat.matrix, seat.offset)
+        com = placement.offset + placement.matrix @ trace.links.nodes[body].com
+        place = Pose(None, placement.matrix, placement.offset)
         moment = newton_euler.body_force(place.rigid_to_parent(trace.links.nodes[body].rigid), move, w, v)
         n, f = Vector(moment[:3]), Vector(moment[3:])
         n, f = R @ (n - cross(com, f)), R @ f

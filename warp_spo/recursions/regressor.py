@@ -19,7 +19,7 @@ from ..trace.scalars import Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, cross, dot, skew, symmetric
 from .kinematics import carried_velocity
 from .model.links import Link
-from .motion import Motion, hinge_motion, whirl
+from .motion import VelocityTerms, hinge_motion, whirl
 from .newton_euler import body_force, hinge_entries, link_acceleration
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def inverse_dynamics_regressor_product(trace: Trace) -> list[Store]:
         m, *rest = (trace.vector("parameters")(COUNT * body + i) for i in range(COUNT))
         xx, xy, yy, xz, yz, zz = rest[3:]
         inertia = Rigid(m, Vector(rest[:3]), symmetric(xx, yy, zz, xy, xz, yz))
-        moving = Motion(motion.spin, whirl(motion.spin), ZERO, ZERO, ZERO)
+        moving = VelocityTerms(motion.spin, whirl(motion.spin), ZERO, ZERO, ZERO)
         own = body_force(inertia, moving, motion.alpha, motion.a)
         n, f = place.force_to_parent(Vector(own[:3]), Vector(own[3:]))
         force = Vector((*n, *f))
@@ -109,9 +109,9 @@ def bodies_in_motion(trace: Trace) -> Iterator[tuple[Link, int, Pose, BodyMotion
 
 def body_frame(trace: Trace, body: int) -> Pose:
     """Return the pose of a body frame in the frame of its link."""
-    seat, (R, p) = trace.links.seats[body], trace.links.nodes[body].anchor
-    axes = seat.matrix @ R.T
-    return Pose(None, None if axes == IDENTITY else axes, seat.offset - axes @ p)
+    placement, (R, p) = trace.links.placements[body], trace.links.nodes[body].anchor
+    axes = placement.matrix @ R.T
+    return Pose(None, None if axes == IDENTITY else axes, placement.offset - axes @ p)
 
 
 def carried_columns(trace: Trace, link: Link, columns: dict[int, dict[int, Twist]]) -> dict[int, Twist]:

@@ -10,12 +10,12 @@ where S and l are resistances and loads of the hinges' laws. G, S and l depend o
 the pass before. Friction, effort limits and dry friction are secants: dampers that give the bound at the v before. The
 first pass closes all candidates, later passes open those that pull, the last of three or more only closes.
 
-A step of four passes or more is made in two rounds of as many passes. Each finds the kick k = -h Mass^-1 c(u, v) / 2
+A step of four passes or more takes two iterations of as many passes. Each finds the kick k = -h Mass^-1 c(u, v) / 2
 half way along u, where c(u, v) = c((u + v) / 2) - c((u - v) / 2) are velocity terms of the mean v of qd and of the
-rates after the step, along a path u, as the round before found both. Passes without velocity terms, at the same place,
-then take qd + k to u, along which q moves, and the rates after the step are u + k. At the end both k become that of the
-u and v which the last round found. How much faster a dof gets that a saturated drive lets go follows from each pass's
-own sweep.
+rates after the step, along a path u, as the previous iteration found both. Passes without velocity terms, at the same
+place, then take qd + k to u, along which q moves, and the rates after the step are u + k. At the end both k become that
+of the u and v which the last iteration found. How much faster a dof gets that a saturated drive lets go follows from
+each pass's own sweep.
 """
 
 from typing import NamedTuple
@@ -28,8 +28,8 @@ from .rotations import homogeneous
 CREEP = 1e-4  # rate below which dry friction is a damper [rad/s, m/s]
 UNBOUNDED, UNLIMITED = 1e6, 1e10  # effort and velocity limits, position limits, of this size and more are none
 HOLD = 300.0  # resistance of a velocity limit, in inertias over the step
-MANY = 4  # passes from which on a step begins with rounds
-ROUNDS = 2  # of as many passes each
+MIDPOINT_PASSES = 4  # passes from which on a step uses the midpoint scheme
+ITERATIONS = 2  # of as many passes each
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
 
 
@@ -88,7 +88,7 @@ class Laws(NamedTuple):
     weight: np.ndarray
 
 
-class Found(NamedTuple):
+class PassResult(NamedTuple):
     """After the last pass: v [dof]; f [point, 3]; excess of cone, adhesion [N] and effort; what was closed."""
 
     v: np.ndarray
@@ -148,7 +148,7 @@ def solve(M, laws, limits, points, v, load, h, passes=3, gravity=0.0, outward=No
         dry_w = np.abs(v) + h * felt[1].weight * np.maximum(0.0, dry_s * np.abs(v) - laws.dry)
     cone, adhesion = ft - points.mu * fn, -_along(points.n, f)
     excess = np.array([np.maximum(x, 0.0).max(initial=0.0) for x in (cone, adhesion, beyond)])
-    return Found(v, f, excess, on)
+    return PassResult(v, f, excess, on)
 
 
 def felt_weights(A, outward, own, weight):
@@ -241,11 +241,11 @@ class ContactStep:
     def run(self, tau=None, body_f=None, passes=3):
         """Return q' and what the passes find."""
         dense, tau = self.dense, 0.0 if tau is None else np.asarray(tau)
-        if passes < MANY or self.scene.contact_pairs:
+        if passes < MIDPOINT_PASSES or self.scene.contact_pairs:
             found = self._passes(tau - dense.bias_force(self.qd, body_f), passes)
             return dense.integrate(found.v, self.h), found
         u = rates = self.qd
-        for _ in range(ROUNDS):
+        for _ in range(ITERATIONS):
             half, kick = self._kick(u, rates)
             there = ContactStep(
                 self.scene, half, self.qd + kick, self.h, *self._targets, self.world, start=dense.q, path=u

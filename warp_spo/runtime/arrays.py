@@ -20,7 +20,7 @@ import warp as wp
 
 from ..errors import refuse_masked
 from . import dlpack, launches
-from .call_order import Turn
+from .call_order import CallOrder
 from .memory import is_same, overlap, view
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ class Call:
         device: The device on which the kernels run.
         dtype: ``wp.float32`` or ``wp.float64``.
         kind: Kind of the result if the call reads no array.
-        turn: The turn that the call has to wait for.
+        call_order: The order of calls in which this call has to wait.
 
     Attributes:
         result: The array of :meth:`write` in the caller's kind, or a tuple of them if :meth:`write` was called more
@@ -134,12 +134,12 @@ class Call:
     """
 
     __slots__ = (
+        "_call_order",
         "_inputs",
         "_outputs",
         "_results",
         "_saved_stream",
         "_staged",
-        "_turn",
         "_waits",
         "device",
         "dtype",
@@ -148,9 +148,11 @@ class Call:
         "result",
     )
 
-    def __init__(self, name: str, device: wp.Device, dtype: type, kind: str | None = None, turn: Turn | None = None):
+    def __init__(
+        self, name: str, device: wp.Device, dtype: type, kind: str | None = None, call_order: CallOrder | None = None
+    ):
         self.name = name
-        self._turn = turn
+        self._call_order = call_order
         self.device = device
         self.dtype = dtype
         self.kind = kind
@@ -163,14 +165,14 @@ class Call:
         self._waits = False  # for kernels that a library does not know of
 
     def __enter__(self) -> "Call":
-        if self._turn is not None:
-            self._turn.lock.acquire()
+        if self._call_order is not None:
+            self._call_order.lock.acquire()
         return self
 
     def order(self) -> None:
         """Let the current stream wait for the call before. Kernels are launched after it; :meth:`write` does it too."""
-        if self._turn is not None and self.device.is_cuda:
-            self._turn.order(self.device.stream)
+        if self._call_order is not None and self.device.is_cuda:
+            self._call_order.order(self.device.stream)
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
         try:
@@ -179,8 +181,8 @@ class Call:
         finally:
             if self._saved_stream is not None:
                 wp.set_stream(self._saved_stream, self.device, sync=False)
-            if self._turn is not None:
-                self._turn.lock.release()
+            if self._call_order is not None:
+                self._call_order.lock.release()
 
     def read(
         self, name: str, array: Any, shape: tuple, meaning: str = "", *, dtype: Any = None, optional: bool = False

@@ -1,4 +1,4 @@
-"""Calls that share scratch memory run one after the other: :class:`Turn`."""
+"""Calls that share scratch memory run one after the other: :class:`CallOrder`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import warp as wp
 _locks: dict[str, threading.RLock] = {}  # of CUDA devices, whose current stream a call may change
 
 
-class Turn:
+class CallOrder:
     """Lets threads, and streams of a CUDA device, wait for each other.
 
     Attributes:

@@ -64,8 +64,8 @@ def is_traced(array: object) -> bool:
 def settle(arguments: Iterable[Any]) -> None:
     """Wait until JAX has computed the arrays among some arguments.
 
-    A caller does so before it takes a turn (:mod:`.call_order`). JAX computes in threads of its own, and what it has
-    not computed yet may be a call of ours that waits for the same turn.
+    A caller does so before it waits for other calls (:mod:`.call_order`). JAX computes in threads of its own,
+    and what it has not computed yet may be a call of ours that waits for the same lock.
     """
     if "jax" in sys.modules:
         kind = sys.modules["jax"].Array

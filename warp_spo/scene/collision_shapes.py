@@ -1,8 +1,9 @@
 """Collision shapes of a robot file or a model, and the contacts with the ground that stand for them.
 
-Loaders describe what a source holds as :class:`Shape`; :class:`Choice` takes some of them by name and puts their points
-on the scene. A sphere and the ends of a capsule touch with their lowest point, exactly. A box has its corners.
-Everything else is the hull of points on its surface, at most so many as the caller says.
+Loaders describe what a source holds as :class:`CollisionShape`; :class:`ShapeSelection` takes some of them by name
+and puts their points on the scene. A sphere and the ends of a capsule touch with their lowest point,
+exactly. A box has its corners. Everything else is the hull of points on its surface, at most so many as the caller
+says.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..errors import UnsupportedError, as_integer
-from .contacts import Contact, HeightField, Plane, Stand, pose_matrix, spread_directions
+from .contacts import Contact, HeightField, NeutralPose, Plane, pose_matrix, spread_directions
 from .hulls import farthest_beyond
 
 if TYPE_CHECKING:
@@ -27,13 +28,13 @@ SPREAD = 256  # points on a round surface, of which those of a hull are chosen
 ROUNDING = 1e-15  # share of a shape's size by which an entry of a point that should be zero may differ
 UPRIGHT = 0.5  # least cosine between the normal of a ground and the upward direction
 STEEP = ", steeper than 60 degrees"  # what a ground is that is not UPRIGHT
-TURNED = 1e-6  # by which axes of a height field may differ from the inertial ones
+AXIS_TOLERANCE = 1e-6  # by which axes of a height field may differ from the inertial ones
 GROUNDS = ("plane", "height field")
 MATERIAL = ("friction", "stiffness", "damping")
 
 
 @dataclasses.dataclass(frozen=True)
-class Shape:
+class CollisionShape:
     """A collision shape of a source.
 
     Attributes:
@@ -64,11 +65,11 @@ class Shape:
     index: int = -1
     triangles: Any = None
 
-    def on(self, soil: Shape | None) -> Shape:
+    def with_mean_material(self, ground_shape: CollisionShape | None) -> CollisionShape:
         """Return the shape with the means of its material and that of the ground, where both have one."""
-        if soil is None:
+        if ground_shape is None:
             return self
-        pairs = {name: (getattr(self, name), getattr(soil, name)) for name in MATERIAL}
+        pairs = {name: (getattr(self, name), getattr(ground_shape, name)) for name in MATERIAL}
         means = {name: 0.5 * (own + other) for name, (own, other) in pairs.items() if None not in (own, other)}
         return dataclasses.replace(self, **means)
 
@@ -85,26 +86,26 @@ class Shape:
         return f"{name} of {'the world' if self.body < 0 else f'body {bodies[self.body]!r}'}"
 
 
-Touches = Callable[[Shape, Shape], bool]
-On = Callable[[Shape, Shape | None], Shape]
+CollisionFilter = Callable[[CollisionShape, CollisionShape], bool]
+MaterialRule = Callable[[CollisionShape, CollisionShape | None], CollisionShape]
 
 
-class Chosen(NamedTuple):
-    """Contacts and ground that a :class:`Choice` finds in a source.
+class SelectedContacts(NamedTuple):
+    """Contacts and ground that a :class:`ShapeSelection` finds in a source.
 
     Attributes:
-        taken: each chosen shape with its contacts. ground: what they touch, None: the plane at height zero.
-        soil: the shape of the source that is the ground, None if the caller gives one or there is none.
+        contacts_by_shape: each chosen shape with its contacts. ground: what they touch, None: the plane at height zero.
+        ground_shape: the shape of the source that is the ground, None if the caller gives one or there is none.
         left_out: in words.
     """
 
-    taken: list[tuple[Shape, list[Contact]]]
+    contacts_by_shape: list[tuple[CollisionShape, list[Contact]]]
     ground: Plane | HeightField | None
-    soil: Shape | None
+    ground_shape: CollisionShape | None
     left_out: list[str]
 
 
-class Choice(NamedTuple):
+class ShapeSelection(NamedTuple):
     """Choice of the shapes of a source that touch the ground, as :func:`warp_spo.load` takes it.
 
     Attributes:
@@ -117,20 +118,20 @@ class Choice(NamedTuple):
     ground: Any = None
     points: Any = POINTS
 
-    def applied(
+    def apply(
         self,
         call: str,
         scene: Scene,
-        shapes: Callable[[], Sequence[Shape]],
-        touches: Touches | None = None,
-        on: On = Shape.on,
+        shapes: Callable[[], Sequence[CollisionShape]],
+        touches: CollisionFilter | None = None,
+        material_rule: MaterialRule = CollisionShape.with_mean_material,
     ) -> tuple[Scene, list[str]]:
         """Return the scene with contacts for the chosen shapes, and in words what is left out, such as "box 'table'".
 
         Args:
             call: for errors. shapes: returns those of the source; called only if some are wanted.
             touches: says whether a shape collides with the ground of the source; None: each of ``shapes`` does.
-            on: returns a shape as it is on the ground of the source, None if that is another one.
+            material_rule: returns a shape with its material on the ground of the source; None: another ground.
 
         Raises:
             ValueError: a pattern matches no shape of a body that can move, a number of points is invalid, or there is a
@@ -139,11 +140,13 @@ class Choice(NamedTuple):
         """
         if not self.wants(call):
             return scene, []
-        found = self.resolve(call, scene, shapes(), touches, on)
-        return scene.with_contacts([one for _, made in found.taken for one in made], found.ground), found.left_out
+        found = self.resolve(call, scene, shapes(), touches, material_rule)
+        return scene.with_contacts(
+            [one for _, made in found.contacts_by_shape for one in made], found.ground
+        ), found.left_out
 
-    def unless(self, disabled: bool) -> tuple[Choice, list[str]]:
-        """Return the choice of a source that may disable contacts, and in words what is left out: True obeys it."""
+    def unless(self, disabled: bool) -> tuple[ShapeSelection, list[str]]:
+        """Return the selection for a source that may disable contacts, and in words what is left out: True obeys it."""
         if not disabled or self.contacts is not True:
             return self, []
         return NONE, ["all contacts, which its options disable (a pattern, such as contacts='*', takes them anyway)"]
@@ -158,26 +161,36 @@ class Choice(NamedTuple):
         return self.contacts is not None
 
     def resolve(
-        self, call: str, scene: Scene, shapes: Sequence[Shape], touches: Touches | None = None, on: On = Shape.on
-    ) -> Chosen:
-        """Return the contacts of the chosen shapes, and what is left out; arguments and errors as :meth:`applied`."""
+        self,
+        call: str,
+        scene: Scene,
+        shapes: Sequence[CollisionShape],
+        touches: CollisionFilter | None = None,
+        material_rule: MaterialRule = CollisionShape.with_mean_material,
+    ) -> SelectedContacts:
+        """Return the contacts of the chosen shapes, and what is left out; arguments and errors as :meth:`apply`."""
         moving = moving_bodies(scene)
         still = [shape for shape in shapes if shape.body < 0 or not moving[shape.body]]
-        ground, soil, others = self.ground, None, [shape for shape in still if shape.kind not in GROUNDS]
+        ground, ground_shape, others = self.ground, None, [shape for shape in still if shape.kind not in GROUNDS]
         if ground is None:
-            ground, soil, others = find_ground(call, scene, still)
+            ground, ground_shape, others = find_ground(call, scene, still)
         solid = [shape for shape in shapes if shape.body >= 0 and moving[shape.body]]
-        if soil is not None and touches is not None:
-            solid = [shape for shape in solid if touches(shape, soil)]
-        taken, left_out = self._choose(call, scene.body_labels, solid)
+        if ground_shape is not None and touches is not None:
+            solid = [shape for shape in solid if touches(shape, ground_shape)]
+        selected, left_out = self._select(call, scene.body_labels, solid)
         words = [shape.words(scene.body_labels) for shape in left_out]
-        steep = STEEP if soil is not None else f"{STEEP}, so that the ground is the plane z = 0"
+        steep = STEEP if ground_shape is not None else f"{STEEP}, so that the ground is the plane z = 0"
         words += [shape.words(scene.body_labels) + (steep if shape.kind in GROUNDS else "") for shape in others]
-        return Chosen([(shape, contacts_of(on(shape, soil), most)) for shape, most in taken], ground, soil, words)
+        return SelectedContacts(
+            [(shape, contacts_of(material_rule(shape, ground_shape), most)) for shape, most in selected],
+            ground,
+            ground_shape,
+            words,
+        )
 
-    def _choose(
-        self, call: str, names: list[str], solid: Sequence[Shape]
-    ) -> tuple[list[tuple[Shape, int]], list[Shape]]:
+    def _select(
+        self, call: str, names: list[str], solid: Sequence[CollisionShape]
+    ) -> tuple[list[tuple[CollisionShape, int]], list[CollisionShape]]:
         """Return the chosen shapes with the most points of each, and those that no contact represents."""
         most: dict[int, int] = {}  # by index of the shape; the first pattern that matches it counts
         for pattern, count in self._patterns(call).items():
@@ -190,7 +203,7 @@ class Choice(NamedTuple):
                 )
             for i in found:
                 most.setdefault(i, count)
-        taken = [(shape, most[i]) for i, shape in enumerate(solid) if i in most and shape.kind in KINDS]
+        selected = [(shape, most[i]) for i, shape in enumerate(solid) if i in most and shape.kind in KINDS]
         others = [shape for i, shape in enumerate(solid) if i in most and shape.kind not in KINDS]
         if others and self.contacts is not True:
             raise UnsupportedError(
@@ -198,7 +211,7 @@ class Choice(NamedTuple):
                 f"contacts={self.contacts!r}, which matches {others[0].words(names)}",
                 f"expected one of {', '.join(KINDS)}; choose other shapes, or add points with scene.with_contacts",
             )
-        return taken, others
+        return selected, others
 
     def _patterns(self, call: str) -> dict[str, int]:
         """Return the most points of a hull by pattern."""
@@ -217,7 +230,7 @@ class Choice(NamedTuple):
         return {name: int(count) for name, count in patterns.items()}
 
 
-NONE = Choice()
+NONE = ShapeSelection()
 """No contacts."""
 
 
@@ -231,7 +244,7 @@ def moving_bodies(scene: Scene) -> np.ndarray:
 
 
 # -- points ------------------------------------------------------------------------------------------------------------
-def contacts_of(shape: Shape, most: int = POINTS) -> list[Contact]:
+def contacts_of(shape: CollisionShape, most: int = POINTS) -> list[Contact]:
     """Return the contacts that stand for a shape, none for one that has no points."""
     place = pose_matrix(shape.pose)
     at = lambda points: _place(np.asarray(points, dtype=np.float64), place)  # noqa: E731
@@ -289,7 +302,7 @@ def _ellipsoid(axes: Any, most: int) -> np.ndarray:
 
 def _hull(points: Any, most: int) -> np.ndarray:
     points = np.asarray(points, dtype=np.float64)
-    return points[reduced(points, most)] if len(points) else np.zeros((0, 3))
+    return points[reduce_points(points, most)] if len(points) else np.zeros((0, 3))
 
 
 KINDS: dict[str, Any] = {
@@ -304,7 +317,7 @@ KINDS: dict[str, Any] = {
 """Kinds of shapes that have points, and how they are found where it takes more than their sizes."""
 
 
-def reduced(points: np.ndarray, most: int) -> np.ndarray:
+def reduce_points(points: np.ndarray, most: int) -> np.ndarray:
     """Return the indices, ascending, of at most so many points whose hull comes near that of all.
 
     Each further point is the one that the hull of those before misses most, in one of many directions: what a plane
@@ -332,21 +345,21 @@ def reduced(points: np.ndarray, most: int) -> np.ndarray:
 
 # -- grounds -----------------------------------------------------------------------------------------------------------
 def find_ground(
-    call: str, scene: Scene, fixed: Sequence[Shape]
-) -> tuple[Plane | HeightField | None, Shape | None, list[Shape]]:
+    call: str, scene: Scene, fixed: Sequence[CollisionShape]
+) -> tuple[Plane | HeightField | None, CollisionShape | None, list[CollisionShape]]:
     """Return the ground among the shapes that stand still and its shape, None without one, and the other shapes.
 
     Raises:
         UnsupportedError: several shapes may be the ground, or a height field that is not level.
     """
-    stand = Stand(scene)
-    grounds: list[tuple[Shape, np.ndarray]] = []
-    others: list[Shape] = []
+    neutral = NeutralPose(scene)
+    grounds: list[tuple[CollisionShape, np.ndarray]] = []
+    others: list[CollisionShape] = []
     for shape in fixed:
         place = pose_matrix(shape.pose)
         if shape.body >= 0:
-            place = stand.places[shape.body] @ place
-        level = shape.kind in GROUNDS and place[:3, 2] @ stand.up > UPRIGHT
+            place = neutral.places[shape.body] @ place
+        level = shape.kind in GROUNDS and place[:3, 2] @ neutral.up > UPRIGHT
         if level:
             grounds.append((shape, place))
         else:
@@ -356,17 +369,17 @@ def find_ground(
         raise UnsupportedError(call, f"several grounds: {names}", "pass ground=spo.Plane(...) or spo.HeightField(...)")
     if not grounds:
         return None, None, others
-    soil, place = grounds[0]
-    return ground_of(call, soil, place, scene.body_labels), soil, others
+    ground_shape, place = grounds[0]
+    return ground_of(call, ground_shape, place, scene.body_labels), ground_shape, others
 
 
-def ground_of(call: str, shape: Shape, place: np.ndarray, bodies: Sequence[str] = ()) -> Plane | HeightField:
+def ground_of(call: str, shape: CollisionShape, place: np.ndarray, bodies: Sequence[str] = ()) -> Plane | HeightField:
     """Return the ground that a plane or a height field is, which stands at ``place`` [4, 4]."""
     if shape.kind == "plane":
         normal = place[:3, 2] / np.linalg.norm(place[:3, 2])
         normal[np.abs(normal) < np.finfo(np.float64).eps] = 0.0
         return Plane(float(normal @ place[:3, 3]) + shape.rounding, normal)
-    if np.abs(place[:3, :3] - np.eye(3)).max() > TURNED:
+    if np.abs(place[:3, :3] - np.eye(3)).max() > AXIS_TOLERANCE:
         raise UnsupportedError(
             call, f"{shape.words(bodies)}, whose axes are turned", "pass ground=spo.HeightField(...) of your own"
         )

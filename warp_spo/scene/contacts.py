@@ -19,10 +19,12 @@ CONTACT_VALUES = ("contact_friction", "contact_stiffness", "contact_damping")
 HEIGHTS = "ground_heights"
 GROUND_VALUES = ("ground_origin", "ground_field", "contact_place", HEIGHTS)
 """Names of a scene's values that come from its ground."""
-SINK = 1.7e-3  # how far a robot sinks in [m] that rests on its points, where the stiffness is chosen
-RESTS = 4  # points at most on which a robot rests
-STANCE = 2  # bodies at most whose points, up to RESTS each, carry a robot
-MARGIN = 1.6  # of the moment that holds up one leg, over what tips it: 360 N m/rad of 226 for a humanoid of 33 kg
+STATIC_SINK = 1.7e-3  # how far a robot sinks in [m] that rests on its points, where the stiffness is chosen
+POINTS_AT_REST = 4  # points at most on which a robot rests
+BODIES_AT_REST = 2  # bodies at most whose points, up to POINTS_AT_REST each, carry a robot
+TIPPING_MARGIN = (
+    1.6  # moment that holds up one leg over the one that tips it: 360 N m/rad of 226 for a humanoid of 33 kg
+)
 DAMPING = 0.5  # of sqrt(k m), the share of mass over one point; standing is quiet from 0.1 to 2
 DIRECTIONS = 2048  # in which the extreme points of a hull are looked for
 AT_ONCE = 1 << 26  # numbers in memory while these points are looked for
@@ -158,7 +160,7 @@ class Contact(StoredPart):
             contact with the ground.
         friction: ratio of the largest friction force to the normal force.
         stiffness: of each point [N/m]; None: so that a robot that stands on up to four points sinks by 1.7 mm, and so
-            that the points of one body, if they span a sole, carry the whole robot. See ``contact_points`` of
+            that the points of one body, if they span an area, carry the whole robot. See ``contact_points`` of
             :class:`Scene`. With ``other``, of the pair; None: the lighter of the two, with all that is connected to
             it, sinks by 0.1 mm where it rests on the other; of bodies connected to each other, with all that they
             carry.
@@ -372,7 +374,7 @@ def check_field(call: str, name: str, array: np.ndarray, ground: Any) -> None:
         )
 
 
-class Stand(Stored):
+class NeutralPose(Stored):
     """A scene in its neutral configuration, as the constants of contacts need it."""
 
     def __init__(self, scene: Any):
@@ -392,7 +394,7 @@ class Stand(Stored):
         self.gravity = float(size) or STANDARD_GRAVITY
         self.up = -values["gravity"] / size if size else np.array([0.0, 0.0, 1.0])
 
-    def at(self, point: ContactPoint) -> np.ndarray:
+    def position(self, point: ContactPoint) -> np.ndarray:
         """Return the place of a point in the inertial frame."""
         place = self.places[point.body]
         return place[:3, :3] @ point.position + place[:3, 3]
@@ -414,40 +416,43 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
     }
     if not scene.contact_count:
         return values
-    stand = Stand(scene)
+    neutral = NeutralPose(scene)
     for i, pair in enumerate(scene.contact_pairs, start=len(points)):
-        found = pair_values(pair, scene, stand)
+        found = pair_values(pair, scene, neutral)
         for name, value in zip(CONTACT_VALUES, found, strict=True):
             values[name][0, i] = value
-    at = np.array([stand.at(point) for point in points])
+    positions = np.array([neutral.position(point) for point in points])
     bodies = np.array([point.body for point in points])
     for i, point in enumerate(points):
-        contact, tree = scene.contacts[point.contact], stand.roots == stand.roots[point.body]
-        mass, own = float(stand.masses[tree].sum()), at[bodies == point.body]
-        com = stand.masses[tree] @ stand.coms[tree] / mass if mass else own.mean(axis=0)
-        rests = min(RESTS, int(tree[bodies].sum()))
+        contact, tree = scene.contacts[point.contact], neutral.roots == neutral.roots[point.body]
+        mass, own = float(neutral.masses[tree].sum()), positions[bodies == point.body]
+        com = neutral.masses[tree] @ neutral.coms[tree] / mass if mass else own.mean(axis=0)
+        at_rest = min(POINTS_AT_REST, int(tree[bodies].sum()))
         k = contact.stiffness
         if k is None:
-            k = max(mass * stand.gravity / (rests * SINK), _sole_stiffness(own, mass * stand.gravity, com, stand.up))
+            k = max(
+                mass * neutral.gravity / (at_rest * STATIC_SINK),
+                _foot_stiffness(own, mass * neutral.gravity, com, neutral.up),
+            )
             k = k or 1.0  # of massless bodies
         d = contact.damping if contact.dissipation is None else contact.dissipation
         if d is None:
-            shared = max(rests, min(STANCE, len(set(bodies[tree[bodies]]))) * min(len(own), RESTS))
+            shared = max(at_rest, min(BODIES_AT_REST, len(set(bodies[tree[bodies]]))) * min(len(own), POINTS_AT_REST))
             d = DAMPING * np.sqrt(k * mass / shared)
         for name, value in zip(CONTACT_VALUES, (contact.friction, k, d), strict=True):
             values[name][0, i] = value
     return {name: read_only(value) for name, value in values.items()}
 
 
-def _sole_stiffness(points: np.ndarray, weight: float, com: np.ndarray, up: np.ndarray) -> float:
-    """Return k with n k b^2 = MARGIN m g l: the points of one body hold up the robot above; 0 without a sole.
+def _foot_stiffness(points: np.ndarray, weight: float, com: np.ndarray, up: np.ndarray) -> float:
+    """Return k with n k b^2 = TIPPING_MARGIN m g l: the points of one body hold up the robot; 0 if they span no area.
 
     b is half the width of the points across their longest extent, l how far the centre of mass lies above them.
     """
     centred = points - points.mean(axis=0)
     width = np.ptp(centred @ np.linalg.svd(centred)[2][1]) / 2.0 if len(points) > 2 else 0.0
     height = max(float(up @ (com - points.mean(axis=0))), 0.0)
-    return MARGIN * weight * height / (len(points) * width**2) if width > 0.0 else 0.0
+    return TIPPING_MARGIN * weight * height / (len(points) * width**2) if width > 0.0 else 0.0
 
 
 def contact_figures(scene: Any) -> str:

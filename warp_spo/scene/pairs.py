@@ -13,16 +13,16 @@ from .checks import read_only, real
 from .hulls import Hull, convex_hull
 from .pickling import StoredPart
 
-SINK = 1e-4  # how far the lighter body sinks in [m] that rests on the other one, where the stiffness is chosen
+STATIC_SINK = 1e-4  # how far the lighter body sinks in [m] that rests on the other one, where the stiffness is chosen
 DAMPING = 2.0  # of sqrt(k m): critical, so that stacks come to rest
 FACE = 8  # corners at most of the common part of two rectangles
 FACES = 16  # corners at most of a face of one hull and one of another together
 PART = 4  # ends of the part of a segment that is near a box or a hull
-ROUND, BOX, HULL = 0, 1, 2
+SWEPT_SEGMENT, BOX, HULL = 0, 1, 2
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Solid(StoredPart):
+class ConvexShape(StoredPart):
     """A convex shape of a body.
 
     Attributes:
@@ -59,7 +59,7 @@ class ContactPair(NamedTuple):
     contact: int
     body: int
     other: int
-    shapes: tuple[Solid, Solid]
+    shapes: tuple[ConvexShape, ConvexShape]
     points: int
     eps: float
 
@@ -87,13 +87,13 @@ def contact_pairs(contacts: Sequence[Any], bodies: Sequence[Any]) -> tuple[Conta
         if other >= 0 and bodies[other].modes is not None:
             raise UnsupportedError(call, "a contact with a body with modes", "let it touch a rigid body")
         both = shape_of(call, contact), shape_of(call, partner)
-        if ROUND not in (kinds := {one.kind for one in both}) and HULL in kinds:
+        if SWEPT_SEGMENT not in (kinds := {one.kind for one in both}) and HULL in kinds:
             both = as_hull(call, both[0]), as_hull(call, both[1])
         found.append(ContactPair(index, body, other, both, most_points(call, *both), contact.eps))
     return tuple(found)
 
 
-def most_points(call: str, first: Solid, second: Solid) -> int:
+def most_points(call: str, first: ConvexShape, second: ConvexShape) -> int:
     """Return how many points two shapes share at most; UnsupportedError if these are more than native code takes."""
     if first.hull is not None and second.hull is not None:
         corners = sum(max(map(len, one.hull.faces)) for one in (first, second) if one.hull is not None)
@@ -103,18 +103,18 @@ def most_points(call: str, first: Solid, second: Solid) -> int:
                 "give fewer points around the largest faces, or spheres in place of one of the two",
             )  # fmt: skip
         return corners
-    if ROUND not in (first.kind, second.kind):
+    if SWEPT_SEGMENT not in (first.kind, second.kind):
         return FACE
-    stick = max(one.size[2] for one in (first, second) if one.kind == ROUND) > 0.0
-    return PART if stick and {first.kind, second.kind} != {ROUND} else 1
+    has_capsule = max(one.size[2] for one in (first, second) if one.kind == SWEPT_SEGMENT) > 0.0
+    return PART if has_capsule and {first.kind, second.kind} != {SWEPT_SEGMENT} else 1
 
 
-def as_hull(call: str, solid: Solid) -> Solid:
+def as_hull(call: str, shape: ConvexShape) -> ConvexShape:
     """Return a box as the hull of its corners, and a hull as it is."""
-    if solid.hull is not None:
-        return solid
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * solid.size
-    return dataclasses.replace(solid, kind=HULL, hull=convex_hull(call, corners, corners)[0])
+    if shape.hull is not None:
+        return shape
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * shape.size
+    return dataclasses.replace(shape, kind=HULL, hull=convex_hull(call, corners, corners)[0])
 
 
 def _partner(call: str, contact: Any, contacts: Sequence[Any]) -> Any:
@@ -135,27 +135,27 @@ def _partner(call: str, contact: Any, contacts: Sequence[Any]) -> Any:
     return own[0]
 
 
-def shape_of(call: str, contact: Any) -> Solid:
+def shape_of(call: str, contact: Any) -> ConvexShape:
     """Return the shape of a contact."""
     places, radius = contact.positions, contact.radius
     if contact.hull is not None:
         hull, middle = convex_hull(call, real(contact.hull), places)
         pose = np.array([*middle, 0.0, 0.0, 0.0, 1.0])
-        return Solid(HULL, read_only(pose), read_only(np.ptp(hull.corners, axis=0) / 2.0), 0.0, hull)
+        return ConvexShape(HULL, read_only(pose), read_only(np.ptp(hull.corners, axis=0) / 2.0), 0.0, hull)
     if contact.box is not None:
         pose, size = contact.frame
-        return Solid(BOX, pose, size, 0.0)
+        return ConvexShape(BOX, pose, size, 0.0)
     half = (places[-1] - places[0]) / 2.0
     length = float(np.linalg.norm(half))
     turn = (0.0, 0.0, 0.0, 1.0) if length == 0.0 else _from_z(half / length)
     pose = np.concatenate([(places[-1] + places[0]) / 2.0, turn])
-    return Solid(ROUND, read_only(pose), read_only(np.array([0.0, 0.0, length])), radius)
+    return ConvexShape(SWEPT_SEGMENT, read_only(pose), read_only(np.array([0.0, 0.0, length])), radius)
 
 
-def pair_values(pair: ContactPair, scene: Any, stand: Any) -> tuple[float, float, float]:
+def pair_values(pair: ContactPair, scene: Any, neutral: Any) -> tuple[float, float, float]:
     """Return friction, stiffness [N/m] and damping [N s/m] of a pair; what its contact leaves open is chosen."""
     contact, parents, masses = scene.contacts[pair.contact], scene.tree.parent, []
-    together = pair.other >= 0 and stand.roots[pair.body] == stand.roots[pair.other]
+    together = pair.other >= 0 and neutral.roots[pair.body] == neutral.roots[pair.other]
     for body in (pair.body, pair.other) if pair.other >= 0 else (pair.body,):
         way = [body]
         while parents[way[-1]] >= 0:
@@ -163,9 +163,11 @@ def pair_values(pair: ContactPair, scene: Any, stand: Any) -> tuple[float, float
         if any(scene.hinges[scene.hinge_of[one]].dof_count for one in way):
             carried = [other for other in range(len(parents)) if not together or scene.tree.is_ancestor(body, other)]
             carried += [body] if together else []
-            masses.append(sum(stand.masses[other] for other in set(carried) if stand.roots[other] == stand.roots[body]))
+            masses.append(
+                sum(neutral.masses[other] for other in set(carried) if neutral.roots[other] == neutral.roots[body])
+            )
     mass = float(min(masses, default=0.0)) or 1.0
-    k = mass * stand.gravity / SINK if contact.stiffness is None else contact.stiffness
+    k = mass * neutral.gravity / STATIC_SINK if contact.stiffness is None else contact.stiffness
     d = DAMPING * np.sqrt(k * mass) if contact.damping is None else contact.damping
     return contact.friction, float(k), float(d)
 

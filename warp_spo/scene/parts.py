@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import UnsupportedError, as_integer
-from ..hinges.custom import MOST, Custom, checked
+from ..hinges.custom import MOST, Custom, check_custom_pose
 from ..hinges.elementary import BY_NAME, elements
 from ..hinges.hinge_type import FREE as FREE
 from ..hinges.hinge_type import SCREWS as SCREWS
-from ..hinges.hinge_type import Element
+from ..hinges.hinge_type import ElementaryHinge
 from .axes import in_plane as in_plane
 from .axes import screws_of
 from .checks import checked_array, checked_unit, read_only
@@ -197,7 +197,9 @@ class Hinge(StoredPart):
     coordinates: int | None = None
     pose: Callable[[list], Any] | None = None
     screws: tuple = dataclasses.field(init=False, repr=False)
-    elements: tuple = dataclasses.field(init=False, repr=False)  # of warp_spo.hinges.hinge_type.Element, inboard first
+    elements: tuple = dataclasses.field(
+        init=False, repr=False
+    )  # of warp_spo.hinges.hinge_type.ElementaryHinge, inboard first
 
     def __post_init__(self) -> None:
         call = f"Hinge({self.label!r})" if self.label else f"Hinge({self.kind!r})"
@@ -210,7 +212,7 @@ class Hinge(StoredPart):
         put("flexible", checked_flexible(call, self.kind, len(screws), self.flexible))
         put("screws", screws if self.flexible is None else screws * 2)  # the motor's, then the deflection's
         if self.kind == "custom":
-            put("elements", (Element(self._custom(call)),))
+            put("elements", (ElementaryHinge(self._custom(call)),))
         elif self.pose is not None or self.coordinates is not None:
             raise ValueError(f"{call}: pose= and coordinates= belong to a custom hinge")
         else:
@@ -244,7 +246,7 @@ class Hinge(StoredPart):
             value = default if getattr(self, name) is None else getattr(self, name)
             value = checked_array(call, name, value, () if np.ndim(value) == 0 else (count,))
             ends.append(np.where(np.abs(value) < UNLIMITED, np.broadcast_to(value, (count,)), np.nan))
-        return checked(call, self.pose, count, *ends)
+        return check_custom_pose(call, self.pose, count, *ends)
 
     @classmethod
     def custom(cls, parent: int, child: int, *, coordinates: int, pose: Callable[[list], Any], **values: Any) -> Hinge:

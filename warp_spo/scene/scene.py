@@ -338,7 +338,7 @@ class Scene(Stored):
         return tuple(found)
 
     @property
-    def ties(self) -> str:
+    def constraint_summary(self) -> str:
         """A list in words of the loop joints and couplings, for messages; empty if there are none."""
         loops = [shown(loop.label) or f"body {loop.parent} to body {loop.child}" for loop in self.loops]
         labels = self.joint_labels

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..errors import UnsupportedError, as_integer
-from .collision_shapes import Shape
+from .collision_shapes import CollisionShape
 from .contacts import Contact, pose_matrix, spread_directions
 from .hulls import Hull, convex_hull, grown, is_convex
 
@@ -36,8 +36,8 @@ HULL_WAYS = (
 class ShapePair(NamedTuple):
     """Two shapes of two bodies; reported forces are those on the first, which moves."""
 
-    first: Shape
-    second: Shape
+    first: CollisionShape
+    second: CollisionShape
 
     @property
     def fits(self) -> bool:
@@ -46,8 +46,8 @@ class ShapePair(NamedTuple):
 
     def contact(self) -> Contact:
         """Return the contact that stands for the pair, with the means of the shapes' materials."""
-        a, b = self.first.on(self.second), self.second
-        solids = [_solid(one, other) for one, other in ((a, b), (b, a))]
+        a, b = self.first.with_mean_material(self.second), self.second
+        solids = [_contact_arguments(one, other) for one, other in ((a, b), (b, a))]
         material = {name: getattr(a, name) for name in ("stiffness", "damping")}
         if a.friction is not None:
             material["friction"] = a.friction
@@ -59,7 +59,7 @@ class ShapePair(NamedTuple):
         return " with ".join(shape.words(bodies) for shape in self)
 
 
-def _solid(shape: Shape, other: Shape) -> dict[str, Any]:
+def _contact_arguments(shape: CollisionShape, other: CollisionShape) -> dict[str, Any]:
     """Return a shape as arguments of a Contact with another one.
 
     A margin makes a box or a hull larger on all sides; that of a hull the sphere or capsule which it meets.
@@ -79,7 +79,7 @@ def _solid(shape: Shape, other: Shape) -> dict[str, Any]:
 
 
 @dataclasses.dataclass(frozen=True)
-class PairChoice:
+class PairSelection:
     """Pairs of shapes of a source that touch each other.
 
     Args:
@@ -92,12 +92,12 @@ class PairChoice:
 
     call: str
     scene: Scene
-    shapes: Sequence[Shape]
-    allowed: Callable[[Shape, Shape], bool]
-    numbers: dict[int, Shape]
+    shapes: Sequence[CollisionShape]
+    allowed: Callable[[CollisionShape, CollisionShape], bool]
+    numbers: dict[int, CollisionShape]
     _lacking: dict[int, str] = dataclasses.field(default_factory=dict, init=False)
 
-    def moves(self, shape: Shape) -> bool:
+    def moves(self, shape: CollisionShape) -> bool:
         """Whether a shape moves; that of a body that is fixed to the inertial frame does not."""
         return self._carrier(shape.body) >= 0
 
@@ -127,7 +127,7 @@ class PairChoice:
 
     def first_of_separate_trees(self) -> ShapePair | None:
         """Return two shapes of bodies that no joint connects, and which may touch; None if there are none."""
-        trees: dict[int, list[Shape]] = {}
+        trees: dict[int, list[CollisionShape]] = {}
         for shape in filter(self.moves, self.shapes):
             body = shape.body
             while self.scene.tree.parent[body] >= 0:
@@ -136,7 +136,7 @@ class PairChoice:
         sides = (pair for one, other in combinations(trees.values(), 2) for pair in product(one, other))
         return next((ShapePair(*pair) for pair in sides if self.allowed(*pair)), None)
 
-    def _all_pairs(self, solid: Sequence[Shape]) -> tuple[list[ShapePair], list[str]]:
+    def _all_pairs(self, solid: Sequence[CollisionShape]) -> tuple[list[ShapePair], list[str]]:
         """Return every pair that may touch, and in words those that no contact represents."""
         pairs = [ShapePair(*pair) for pair in combinations(solid, 2) if self._may_touch(*pair)]
         found = [pair for pair in pairs if self._stands(pair)]
@@ -176,13 +176,13 @@ class PairChoice:
         """Whether a contact can stand for a pair."""
         return pair.fits and not any(map(self._lacks, pair))
 
-    def _lacks(self, shape: Shape) -> str:
+    def _lacks(self, shape: CollisionShape) -> str:
         """Return why no contact can have a shape of its kind; "" if one can."""
         if shape.index not in self._lacking:
-            self._lacking[shape.index] = _hollow(shape)
+            self._lacking[shape.index] = _why_not_convex(shape)
         return self._lacking[shape.index]
 
-    def _shapes_of_name(self, name: Any) -> list[Shape]:
+    def _shapes_of_name(self, name: Any) -> list[CollisionShape]:
         """Return the shapes of a name or a number."""
         number, bodies = as_integer(name), self.scene.body_labels
         if number is not None:
@@ -197,7 +197,7 @@ class PairChoice:
             raise ValueError(f"{self.call}: pairs holds {name!r}, which is no collision shape; expected {known}")
         return found
 
-    def _may_touch(self, a: Shape, b: Shape) -> bool:
+    def _may_touch(self, a: CollisionShape, b: CollisionShape) -> bool:
         """Whether two shapes can move against each other, and the source lets them collide."""
         return self._carrier(a.body) != self._carrier(b.body) and self.allowed(a, b)
 
@@ -209,7 +209,7 @@ class PairChoice:
         return body
 
 
-def _hollow(shape: Shape) -> str:
+def _why_not_convex(shape: CollisionShape) -> str:
     """Return why a contact cannot have a shape whose kind it may have; "" if it can."""
     if shape.kind != "hull":
         return ""
@@ -224,7 +224,7 @@ def _hollow(shape: Shape) -> str:
     return "a mesh that is not convex"
 
 
-def _hull_of(shape: Shape) -> tuple[Hull, np.ndarray]:
+def _hull_of(shape: CollisionShape) -> tuple[Hull, np.ndarray]:
     """Return the hull of a shape's points about its middle, and that, in the axes of its pose."""
     points = np.asarray(shape.sizes, dtype=np.float64)
     outward = np.concatenate([spread_directions(SOME), np.eye(3), -np.eye(3)])

@@ -111,7 +111,7 @@ class Record:
                 f"expected the values of the call; call backward before Dynamics.set, or set tensors that require grad"
             )
         before = {name: by_name[name] for name in changed if name in self.values}
-        with self.dyn.recursions.turn.lock, gradients.at_values(before):
+        with self.dyn.recursions.call_order.lock, gradients.at_values(before):
             return gradients.pull_back(self.operation, arrays, self.options, results, cotangents, wanted)
 
 

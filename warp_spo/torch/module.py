@@ -16,7 +16,7 @@ def _make_method(operation: str) -> Callable[..., Any]:
     """Return a method of :class:`Module` that sets the parameters and calls an operation of Dynamics."""
 
     def method(self: "Module", *args: Any, **more: Any) -> Any:
-        with self.dyn.recursions.turn.lock:  # no other thread may set values between
+        with self.dyn.recursions.call_order.lock:  # no other thread may set values between
             self.dyn.set(**dict(self.named_parameters()))
             return self.dyn._operations[operation].method_of_users(self.dyn, *args, **more)
 

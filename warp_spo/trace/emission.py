@@ -63,9 +63,9 @@ def literal(x: float, dtype: str) -> str:
 
 
 class Listing(NamedTuple):
-    """Statements with placeholders for everything that may differ between equal pieces of a robot.
+    """Statements with placeholders for everything that may differ between equal segments of a robot.
 
-    Two limbs of equal structure have equal ``text``.
+    Two segments of equal structure have equal ``text``.
 
     Attributes:
         text: the statements.

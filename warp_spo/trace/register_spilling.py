@@ -1,7 +1,7 @@
-"""Values set aside: straight-line code that keeps a value in shared memory while nothing uses it.
+"""Spill registers to shared memory: straight-line code that keeps a value there while nothing uses it.
 
 A compiler keeps every value that is used later in a register, and takes local memory where registers do not suffice.
-Fewer registers let more warps run at once, and shared memory has room for what each of their threads sets aside.
+Fewer registers let more warps run at once, and shared memory has room for the values that their threads spill.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ WORD = re.compile(r"\b[A-Za-z_]\w*\b")
 PAIR = re.compile(r"(?:on::sincos\w*\((.*), |float |double )(\w+), (\w+)(?:\)|);")  # as :mod:`.emission` defines two
 
 
-class Gap(NamedTuple):
+class LiveGap(NamedTuple):
     """The statements ``begin`` and ``end`` that use a value, or define it, and none between them does."""
 
     begin: int
@@ -25,8 +25,8 @@ class Gap(NamedTuple):
     name: str
 
 
-def set_aside(text: str, dtype: str, places: int) -> str:
-    """Return statements that set values aside in ``ASIDE(place)`` while nothing uses them, longest gaps first.
+def spill_registers(text: str, dtype: str, places: int) -> str:
+    """Return statements that keep values in ``ASIDE(place)`` while nothing uses them, longest gaps first.
 
     Args:
         text: the statements of one thread, with the names in full.
@@ -37,7 +37,7 @@ def set_aside(text: str, dtype: str, places: int) -> str:
     scopes = _find_scopes(lines)
     gaps = sorted(_find_gaps(lines, scopes, dtype), key=lambda gap: gap.begin - gap.end)
     stores: dict[int, list[tuple[str, int]]] = {}  # by the statement after which they follow
-    reads: dict[int, list[tuple[Gap, int]]] = {}  # by the statement before which they come
+    reads: dict[int, list[tuple[LiveGap, int]]] = {}  # by the statement before which they come
     for gap, place in _assign_places(_choose(gaps, places, len(lines)), places):
         stores.setdefault(gap.begin, []).append((gap.name, place))
         at = gap.end
@@ -90,7 +90,7 @@ def _find_scopes(lines: list[str]) -> list[int]:
     return found
 
 
-def _find_gaps(lines: list[str], scopes: list[int], dtype: str) -> Iterator[Gap]:
+def _find_gaps(lines: list[str], scopes: list[int], dtype: str) -> Iterator[LiveGap]:
     """Yield the gaps that are long enough, with both ends inside the same braces as the definition, of every value."""
     latest: dict[str, int] = {}  # the last statement that defines or uses a value
     home: dict[str, int] = {}
@@ -100,13 +100,13 @@ def _find_gaps(lines: list[str], scopes: list[int], dtype: str) -> Iterator[Gap]
         used, defined = _definitions(line, dtype)
         for name in set(WORD.findall(used)) & latest.keys():
             if at - latest[name] > LEAST and home[name] == scopes[at] == scopes[latest[name]]:
-                yield Gap(latest[name], at, name)
+                yield LiveGap(latest[name], at, name)
             latest[name] = at
         latest.update(dict.fromkeys(defined, at))
         home.update(dict.fromkeys(defined, scopes[at]))
 
 
-def _choose(gaps: list[Gap], places: int, statements: int) -> list[Gap]:
+def _choose(gaps: list[LiveGap], places: int, statements: int) -> list[LiveGap]:
     """Return the gaps of which at most ``places`` meet at any statement, the first of ``gaps`` before later ones."""
     taken, chosen = [0] * statements, []
     for gap in gaps:
@@ -117,7 +117,7 @@ def _choose(gaps: list[Gap], places: int, statements: int) -> list[Gap]:
     return sorted(chosen)
 
 
-def _assign_places(gaps: list[Gap], places: int) -> Iterator[tuple[Gap, int]]:
+def _assign_places(gaps: list[LiveGap], places: int) -> Iterator[tuple[LiveGap, int]]:
     """Yield each gap, in order, with a place that no other gap has at the same time."""
     free, busy = list(range(places)), []  # type: list[int], list[tuple[int, int]]
     for gap in gaps:

@@ -20,7 +20,7 @@ CAMERA = films.Camera(azimuth=-1.3, elevation=0.12, width=240, height=300, view=
 LENGTH, THICK = 1.0, 0.015  # of a force of the robot's weight, and radius; over the robot's size
 
 
-class Frame(NamedTuple):
+class Snapshot(NamedTuple):
     """A moment: coordinates, poses [body, 7] and contact forces [point, 3] of a robot, and what a table says of it.
 
     ``height`` is that of the base [m], ``load`` the sum of vertical forces over the weight, ``touching`` the number of
@@ -45,7 +45,7 @@ def make_ground(name: str) -> HeightField | None:
     return terrain.stairs((8.0, 8.0), 0.05, riser=0.05, tread=0.4) if name == "stairs" else None
 
 
-def drop(robot: Any, device: wp.Device) -> list[Frame]:
+def drop(robot: Any, device: wp.Device) -> list[Snapshot]:
     """Return the frames of a robot of :mod:`warp_spo.env.robots` that is dropped, its servos holding its stand."""
     scene = robot.scene
     dyn = Dynamics(scene, 1, device)
@@ -62,11 +62,11 @@ def drop(robot: Any, device: wp.Device) -> list[Frame]:
         acts = np.abs(force[0]).sum(axis=1) > 0.0
         load, slides = float(force[0, :, 2].sum() / weight), float((slip[0] * acts).max(initial=0.0))
         told = float(q[0, 2]), load, int(acts.sum()), slides, int(status[0])
-        found.append(Frame(number * PERIOD, q[0].copy(), dyn.body_poses(q)[0], force[0].copy(), *told))
+        found.append(Snapshot(number * PERIOD, q[0].copy(), dyn.body_poses(q)[0], force[0].copy(), *told))
     return found
 
 
-def table(frames: list[Frame]) -> list[str]:
+def table(frames: list[Snapshot]) -> list[str]:
     """Return the lines of a table of frames."""
     head = (
         f"{'time [s]':>8s} {'height [m]':>10s} {'force / m g':>11s} {'points':>6s} {'slip [mm/s]':>11s} {'status':>6s}"
@@ -75,7 +75,7 @@ def table(frames: list[Frame]) -> list[str]:
     return [head, *(line.format(frame, 1e3 * frame.slip) for frame in frames)]
 
 
-def draw(robot: Any, frames: list[Frame], device: Any = "cpu") -> list:
+def draw(robot: Any, frames: list[Snapshot], device: Any = "cpu") -> list:
     """Return a picture of every frame: the robot from the side, its contact forces as capsules."""
     scene, size = robot.scene, shapes.size_of(robot.scene, robot.q)
     scale = LENGTH * size / (9.81 * float(scene.values["body_mass"].sum()))

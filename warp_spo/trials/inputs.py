@@ -14,7 +14,7 @@ import numpy as np
 
 from ..dynamics.dynamics import OPERATIONS as DECLARED
 from ..dynamics.dynamics import Dynamics
-from ..dynamics.operation import Operation as Declaration
+from ..dynamics.operation import Operation
 from ..dynamics.spatial_operators import EXPRESSION
 from ..dynamics.trial_inputs import DT, FRAME_POSE, every_other, rotations, two_frames
 from ..execution.routine import Routine
@@ -35,7 +35,7 @@ Shape = Callable[[Scene], tuple[int, ...]]
 
 
 @dataclasses.dataclass(frozen=True)
-class Operation:
+class TrialCase:
     """One operation on a :class:`warp_spo.trials.trial.Subject`.
 
     Attributes:
@@ -160,7 +160,7 @@ class Inputs:
             self._dense[world] = self.reference(self.scene, self.array("q")[world], world=world)
         return self._dense[world]
 
-    def expected(self, operation: Operation, at: Inputs, world: int) -> tuple[np.ndarray, float]:
+    def expected(self, operation: TrialCase, at: Inputs, world: int) -> tuple[np.ndarray, float]:
         """What ``operation`` gives in one world for these inputs at q of ``at``; kept, for every precision to meet."""
         key = operation.name, operation.reference, at.seed, world
         if key not in self._expected:
@@ -191,14 +191,14 @@ def _size(axis: str, scene: Scene) -> int:
     return {**sizes, "frame": frames}[axis]
 
 
-def of_declaration(declaration: Declaration) -> Operation:
+def trial_case(operation: Operation) -> TrialCase:
     """Return a declared operation of Dynamics for trials."""
-    trial, first = declaration.trial, declaration.results[0] if declaration.results else None
+    trial, first = operation.trial, operation.results[0] if operation.results else None
     assert trial is not None
-    arrays = [one for one in declaration.arrays if not (one.asked or one.direction)]
+    arrays = [one for one in operation.arrays if not (one.asked or one.direction)]
     reads = trial.reads or tuple(one.sample or one.name for one in arrays)
-    samples = {one.name: one.sample for one in declaration.options if one.sample is not None}
-    others = len(declaration.results) - 1
+    samples = {one.name: one.sample for one in operation.options if one.sample is not None}
+    others = len(operation.results) - 1
 
     def call(subject: Any, *inputs: Any, out: Any) -> None:
         dyn = subject.dyn
@@ -207,8 +207,8 @@ def of_declaration(declaration: Declaration) -> Operation:
             return
         given = {one.name: array for one, array in zip(arrays, inputs, strict=True)}
         given |= {name: sample(dyn.scene) for name, sample in samples.items()}
-        more = [dyn.recursions.array(f"trial of {declaration.name} {i}", *out.shape) for i in range(others)]
-        declaration.entry(dyn, **given, out=(out, *more) if more else out)
+        more = [dyn.recursions.array(f"trial of {operation.name} {i}", *out.shape) for i in range(others)]
+        operation.entry(dyn, **given, out=(out, *more) if more else out)
 
     def reference(dense: Dense, *inputs: Any) -> Any:
         return trial.dense(dense, *inputs, *(sample(dense.scene) for sample in samples.values()))
@@ -219,19 +219,19 @@ def of_declaration(declaration: Declaration) -> Operation:
 
     more: dict[str, Any] = {} if trial.scale is None else {"scale": trial.scale}
     more |= {} if first is None else {"quaternions": first.quaternions}
-    routine = declaration.routine
-    return Operation(declaration.name, reads, shape, call, reference, **more, solves=trial.solves, routine=routine)
+    routine = operation.routine
+    return TrialCase(operation.name, reads, shape, call, reference, **more, solves=trial.solves, routine=routine)
 
 
 def _operator(
     name: str, of: Callable[[Any], Any], reference: Callable[..., Any], reads: str = "x", shape: Shape = _nodes
-) -> Operation:
+) -> TrialCase:
     """An operator of the scene, ``of(subject)``, applied to a vector over the nodes or another."""
 
     def call(subject: Any, x: Any, out: Any) -> None:
         of(subject).apply(x, out=out)
 
-    return Operation(name, (reads,), shape, call, reference, at_first_q=True, routine=EXPRESSION)
+    return TrialCase(name, (reads,), shape, call, reference, at_first_q=True, routine=EXPRESSION)
 
 
 _OPERATORS = (
@@ -239,7 +239,7 @@ _OPERATORS = (
     _operator("phi.T", lambda subject: subject.operators.phi.T, lambda d, x: d.phi.T @ x),
     _operator("psi", lambda subject: subject.operators.psi, lambda d, x: d.psi @ x),
     _operator("mass@v", lambda subject: subject.mass, lambda d, v: d.mass_matrix @ v, "b", _dof),
-    Operation(
+    TrialCase(
         "operators.update",
         ("q", "x"),
         _nodes,
@@ -249,10 +249,8 @@ _OPERATORS = (
         routine=EXPRESSION,
     ),
 )
-_MAIN = {name: of_declaration(one) for name, one in DECLARED.items() if one.trial is not None and one.trial.main}
+_MAIN = {name: trial_case(one) for name, one in DECLARED.items() if one.trial is not None and one.trial.main}
 OPERATIONS = {operation.name: operation for operation in _OPERATORS} | _MAIN
 """Name -> operation, in the order of the tables that show them: operators of a scene, then calls of Dynamics."""
-APPLICATIONS = {
-    name: of_declaration(one) for name, one in DECLARED.items() if one.trial is not None and name not in _MAIN
-}
+APPLICATIONS = {name: trial_case(one) for name, one in DECLARED.items() if one.trial is not None and name not in _MAIN}
 """The other operations of Dynamics that have a dense reference, for the same tables; each compiles a kernel."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from ..viewing import charts
-from ..viewing.charts import Point
+from ..viewing.charts import ChartPoint
 
 HEADS = ("operation", "granularity", "precision", "error", "time", "evaluations/s")
 BAR = 30  # characters
@@ -150,7 +150,7 @@ def picture(pyplot: Any, title: str, rows: Sequence[dict], tolerance: dict[str, 
         lost = f", {len(mine) - len(shown)} without a result" if len(shown) < len(mine) else ""
         axes.set_title(f"{dtype}, tolerance {charts.power_text(tolerance[dtype])}{lost}")
         axes.set_ylabel("largest relative error")
-        points = [Point(1e6 * row["seconds"], error, row["op"], charts.OURS if error <= tolerance[dtype] else
+        points = [ChartPoint(1e6 * row["seconds"], error, row["op"], charts.OURS if error <= tolerance[dtype] else
                   charts.INK) for row, error in zip(shown, errors, strict=True)]  # fmt: skip
         panels.append((axes, charts.MARKERS[dtype], points))
     grid[-1, 0].set_xlabel("run time of all worlds")

@@ -13,7 +13,7 @@ import warp as wp
 from ..dynamics.dynamics import Dynamics
 from ..dynamics.spatial_operators import SpatialOperators
 from ..graph.algebra import Operator
-from .inputs import Inputs, Operation
+from .inputs import Inputs, TrialCase
 
 SAMPLE = 8  # worlds that are compared with the reference, which takes 10 to 100 ms a world
 WARM_UP = 0.2  # [s] of evaluations before timing, in which clocks rise and caches fill
@@ -62,7 +62,7 @@ class Timing(NamedTuple):
     high: float
 
 
-class Trial:
+class TrialRun:
     """One operation of a subject. The constructor runs the first evaluation.
 
     Args:
@@ -78,7 +78,7 @@ class Trial:
         bytes: Bytes of the caller's arrays that one evaluation reads and writes. None if the result is not among them.
     """
 
-    def __init__(self, subject: Subject, operation: Operation, sample: int = SAMPLE):
+    def __init__(self, subject: Subject, operation: TrialCase, sample: int = SAMPLE):
         self.subject, self.operation, self.sample = subject, operation, sample
         self.forward_errors: list[float] = []
         self.backward_errors: list[float] = []
@@ -113,7 +113,7 @@ class Trial:
 
         The error is NaN if the result of any world is not finite.
 
-        See :meth:`warp_spo.trials.inputs.Operation.error`.
+        See :meth:`warp_spo.trials.inputs.TrialCase.error`.
         """
         operation, subject, worlds = self.operation, self.subject, self.subject.dyn.worlds
         if operation.reveal:

@@ -48,7 +48,7 @@ CLOSE = 6.0  # price of a place that is nearer to the point of another name, in 
 LEADER = 15.0  # from this distance on a line joins a name and its point [pt]
 
 
-class Point(NamedTuple):
+class ChartPoint(NamedTuple):
     """A point of a panel in data coordinates, and the name that stands beside it."""
 
     x: float
@@ -167,7 +167,7 @@ def _legible_ticks(axis: Any, ticks: Sequence[float], text: Any, span: float) ->
 
 
 def label_points(
-    axes: Any, points: Sequence[Point], size: float = 8.5, also: Sequence[tuple[float, float]] = ()
+    axes: Any, points: Sequence[ChartPoint], size: float = 8.5, also: Sequence[tuple[float, float]] = ()
 ) -> None:
     """Write each point's name beside it, where it hides as few points and names as can be.
 

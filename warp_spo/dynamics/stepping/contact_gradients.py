@@ -27,13 +27,12 @@ from ...recursions.derivatives.contact_pass import (
     contact_pass,
     count_laws,
     count_variables,
-    weighed_pieces,
+    weighed_segments,
 )
 from ...recursions.model.messages import SIZES
 from ...recursions.model.tracing import Trace
 from ...scene.contacts import HEIGHTS, HeightField
-from . import midpoint_contact as rounds
-from . import midpoint_contact_gradients as rounds_back
+from . import midpoint_contact, midpoint_contact_gradients
 
 if TYPE_CHECKING:
     from ..dynamics import Dynamics
@@ -70,8 +69,8 @@ def launch(
     count = PASSES if passes is None else passes
     given = {name: value for name, value in given.items() if value is not None}
     results = dict(zip(wrt, (out, *more.values()), strict=True))
-    if rounds.in_rounds(dyn.scene, count):
-        rounds_back.pull_back(dyn, functools.partial(_launch, dyn), results, count, **given)
+    if midpoint_contact.uses_midpoint(dyn.scene, count):
+        midpoint_contact_gradients.backpropagate(dyn, functools.partial(_launch, dyn), results, count, **given)
     else:
         _launch(dyn, results, count, **given)
 
@@ -125,12 +124,12 @@ def _launch(dyn: Dynamics, asked: dict[str, wp.array], count: int, **given: Any)
 
 
 def _laws(dyn: Dynamics, inputs: tuple[str, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return how many variables the laws of each link have, and which pieces carry what these laws feel.
+    """Return how many variables the laws of each link have, and which segments carry what these laws feel.
 
     Both depend on what is given besides the state.
     """
     known = dyn._gradients.pass_laws
     if inputs not in known:
         traces = (Trace(dyn.programs.links.with_tables(), dyn.dtype.__name__, inputs) for _ in range(2))
-        known[inputs] = count_laws(next(traces)), weighed_pieces(next(traces))
+        known[inputs] = count_laws(next(traces)), weighed_segments(next(traces))
     return known[inputs]

@@ -8,7 +8,7 @@ import warp as wp
 
 from ...errors import UnsupportedError, as_integer
 from ...kernels import combination
-from ...recursions.contact import step as ground
+from ...recursions.contact import step as contact_step
 from ...recursions.contact.pair_pieces import by_limbs
 from ...recursions.contact.pairs import RESIDUAL, default_passes
 from ...runtime.arrays import Call
@@ -20,7 +20,7 @@ from . import integrators
 if TYPE_CHECKING:
     from ..dynamics import Dynamics
 
-REPORTS = (*ground.REPORTS, RESIDUAL)
+REPORTS = (*contact_step.REPORTS, RESIDUAL)
 AXES = ("world, contact, 3", "world, contact", "world, contact", "world, 3", "world")
 ARGUMENTS = tuple(
     Argument(name, axes, optional=True, asked=True, written=True) for name, axes in zip(REPORTS, AXES, strict=True)

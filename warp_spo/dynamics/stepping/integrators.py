@@ -23,7 +23,7 @@ from ...runtime.arrays import Call
 from ...scene.scene import Scene
 from ..forward_dynamics import accelerations
 from ..kinematics import BODY_STATES
-from . import midpoint_contact as rounds
+from . import midpoint_contact
 from .midpoint_contact import CONTACT_STEP
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ RK4 = ((0.0, 1.0 / 6.0), (0.5, 1.0 / 3.0), (0.5, 1.0 / 3.0), (1.0, 1.0 / 6.0))
 
 
 def _divides(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
-    return recursion.by_pieces(scene)
+    return recursion.by_segments(scene)
 
 
 def _limbs_couple(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
@@ -44,7 +44,9 @@ def _limbs_couple(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
 
 
 STEP = Routine("step", recursion.step, letters="PzaSX", divides=_divides, passes=True, wide=True)
-BODIES_BY_WALKS = Routine("body_states", kinematics.body_states, alone=True, passes=True, wide=True, walks=True)
+BODIES_BY_KINEMATICS = Routine(
+    "body_states", kinematics.body_states, alone=True, passes=True, wide=True, body_kinematics=True
+)
 PAIRED_STEP = Routine(
     "paired_step", pair_pieces.step, letters="PzafSE", divides=_limbs_couple, passes=True, counted=True, wide=True,
     couples=True,
@@ -63,7 +65,7 @@ def contact_routine(dyn: Dynamics) -> Routine:
     return PAIRED_STEP if dyn.scene.contact_pairs else CONTACT_STEP
 
 
-class Interval(NamedTuple):
+class StepArrays(NamedTuple):
     """The state before a step, arrays for the state after it, and its length [s]."""
 
     q: wp.array
@@ -76,7 +78,7 @@ class Interval(NamedTuple):
 def semi_implicit(
     dyn: Dynamics,
     call: Call,
-    interval: Interval,
+    interval: StepArrays,
     qdd: wp.array | None = None,
     status: wp.array | None = None,
     bodies: tuple[wp.array, wp.array] | None = None,
@@ -104,8 +106,8 @@ def semi_implicit(
     if dyn.scene.contacts:
         count = float(pairs.default_passes(dyn.scene) if passes is None else passes)
         given |= {"passes": count, "reports": tuple(reports or ()), **option}
-        if rounds.in_rounds(dyn.scene, count):
-            rounds.step(dyn, dt, (q_out, qd_out), more | (reports or {}), q, qd, **given)
+        if midpoint_contact.uses_midpoint(dyn.scene, count):
+            midpoint_contact.step(dyn, dt, (q_out, qd_out), more | (reports or {}), q, qd, **given)
         else:
             launch(contact_routine(dyn), qd_out, more | (reports or {}), qd=qd, dt=dt, q=q, **given)
     elif not dyn.closed:
@@ -136,15 +138,15 @@ def arrays_of_bodies(dyn: Dynamics, states: dict[str, Any]) -> tuple[wp.array, w
 def write_bodies(dyn: Dynamics, q: wp.array, qd: wp.array, bodies: tuple[wp.array, wp.array]) -> None:
     """Launch the poses and velocities of the bodies at a state."""
     more = {"velocities_out": bodies[1]}
-    if _walks(dyn) and dyn._engine.has_program(BODIES_BY_WALKS, bodies[0], more, q=q, qd=qd):
-        dyn._engine.launch_routine(BODIES_BY_WALKS, bodies[0], more, q=q, qd=qd)
+    if _walks(dyn) and dyn._engine.has_program(BODIES_BY_KINEMATICS, bodies[0], more, q=q, qd=qd):
+        dyn._engine.launch_routine(BODIES_BY_KINEMATICS, bodies[0], more, q=q, qd=qd)
     else:
         dyn._engine.launch(BODY_STATES, bodies[0], more, q=q, qd=qd)
 
 
 def _walks(dyn: Dynamics) -> bool:
     """Whether a kernel of its own walks to the bodies after a step: whatever the number of worlds, for equal bits."""
-    return dyn.plan.of(STEP) == "segment" and dyn.programs.builder.walks
+    return dyn.plan.of(STEP) == "segment" and dyn.programs.builder.supports_body_kinematics
 
 
 def several_launches(dyn: Dynamics, integrator: str, acts: bool, delays: bool, passes: int | None = None) -> str:
@@ -159,8 +161,8 @@ def several_launches(dyn: Dynamics, integrator: str, acts: bool, delays: bool, p
         return "loops='multipliers' takes several"
     if dyn.scene.contact_pairs:
         return "bodies that touch each other take one for each"
-    if passes is not None and rounds.in_rounds(dyn.scene, passes):
-        return f"{passes} passes are preceded by rounds"
+    if passes is not None and midpoint_contact.uses_midpoint(dyn.scene, passes):
+        return f"{passes} passes take iterations of the midpoint scheme"
     if delays:
         return "delays of actuators count substeps"
     tendons = acts and any(len(actuator.hinges) > 1 for actuator in dyn.scene.actuators)
@@ -195,13 +197,13 @@ def _step_under_multipliers(
         dyn.recursions.launch(loops.mark_open, dyn.worlds, [left], [asked["status"]])
 
 
-def midpoint(dyn: Dynamics, call: Call, interval: Interval, **forces: Any) -> None:
+def midpoint(dyn: Dynamics, call: Call, interval: StepArrays, **forces: Any) -> None:
     """Launch the implicit midpoint rule: half a step whose sweep and laws are evaluated at the midpoint itself."""
     q, qd, q_out, qd_out, dt = interval
     q_at, qd_at, q_next, qd_next = (_scratch(dyn, f"midpoint {i}", a) for i, a in enumerate((q, qd, q, qd)))
-    semi_implicit(dyn, call, Interval(q, qd, q_at, qd_at, 0.5 * dt), **forces)
+    semi_implicit(dyn, call, StepArrays(q, qd, q_at, qd_at, 0.5 * dt), **forces)
     for _ in range(MIDPOINT_ITERATIONS):
-        half = Interval(q_at, qd_at, q_next, qd_next, 0.5 * dt)
+        half = StepArrays(q_at, qd_at, q_next, qd_next, 0.5 * dt)
         semi_implicit(dyn, call, half, q_from=q, qd_from=qd, **forces)
         q_at, qd_at, q_next, qd_next = q_next, qd_next, q_at, qd_at
     dyn._engine.launch_routine(INTEGRATE, q_next, q=q, qd=qd_at, dt=dt)
@@ -212,7 +214,7 @@ def midpoint(dyn: Dynamics, call: Call, interval: Interval, **forces: Any) -> No
 def rk4(
     dyn: Dynamics,
     call: Call,
-    interval: Interval,
+    interval: StepArrays,
     tau: wp.array | None,
     body_f: wp.array | None,
     **targets: Any,

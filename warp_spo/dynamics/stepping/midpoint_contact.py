@@ -1,8 +1,9 @@
-"""Steps with contacts whose velocity terms are kicks from half way: their rounds.
+"""The midpoint scheme of steps with contacts: velocity terms act as two half-step impulses.
 
-From MANY passes on a step is made in ROUNDS of as many passes each. A round finds what velocity terms do to the rates
-half way through the step that the round before has found, and makes the whole step with that. At the end the rates
-receive what velocity terms do half way through that step itself, see :mod:`warp_spo.recursions.contact.velocity_kicks`.
+Steps of MIDPOINT_PASSES passes and more use it. Each iteration evaluates the velocity terms at the midpoint of the
+previous iteration's step and repeats the step with them. ITERATIONS iterations are made, of all passes each. Then
+velocity terms are evaluated at the midpoint of the last one's step, see
+:mod:`warp_spo.recursions.contact.velocity_kicks`.
 """
 
 from __future__ import annotations
@@ -13,8 +14,17 @@ import warp as wp
 
 from ...execution.routine import Routine
 from ...kernels.status import mark_unsettled
-from ...recursions.contact import step as contact
-from ...recursions.contact.velocity_kicks import FOUND, GAINED, KICK, KICKED, PATH, START, last_kick, middle_kick
+from ...recursions.contact import step as contact_step
+from ...recursions.contact.velocity_kicks import (
+    KICK,
+    PASS_ACCELERATION,
+    PATH,
+    PREVIOUS_KICK,
+    PREVIOUS_RATES,
+    START,
+    final_kick,
+    first_kick,
+)
 from ...recursions.derivatives import adjoints
 from ...runtime import launches
 from ...scene.scene import Scene
@@ -22,28 +32,30 @@ from ...scene.scene import Scene
 if TYPE_CHECKING:
     from ..dynamics import Dynamics
 
-MANY = 4  # passes from which on a step is made in rounds
-ROUNDS = 2
-UNSETTLED = 0.1  # share of the largest rate by which the end may change a rate without a word
-CONTACT_STEP = Routine("contact_step", contact.step, letters="PzafSE", passes=True, counted=True, wide=True)
-MIDDLE_KICK = Routine("middle_kick", middle_kick, letters="fPza")
-LAST_KICK = Routine("last_kick", last_kick, letters="fPza")
+MIDPOINT_PASSES = 4  # passes from which on a step uses the midpoint scheme
+ITERATIONS = 2
+UNSETTLED = 0.1  # share of the largest rate by which the final kick may change a rate without a status
+CONTACT_STEP = Routine("contact_step", contact_step.step, letters="PzafSE", passes=True, counted=True, wide=True)
+FIRST_KICK = Routine("middle_kick", first_kick, letters="fPza")
+FINAL_KICK = Routine("last_kick", final_kick, letters="fPza")
 INTEGRATE_VJP = Routine("integrate_vjp", adjoints.integrate_vjp)
 
 
-class Round(NamedTuple):
-    """Inputs and results of a round of a step.
+class MidpointIteration(NamedTuple):
+    """Inputs and results of one iteration of a step.
 
     Attributes:
-        before, kicked: rates after the step and kick that the round before found; of the first round, those before the
-            step and zero [world, dof].
-        kick: what velocity terms add to the rates in half a step. path: the rates along which q moves.
-        q: coordinates half way along the path, at which the kick was found and the passes are.
-        found, gained: rates after the step, and what its passes add to them over its length.
+        previous_rates: rates after the step of the previous iteration; qd in the first one [world, dof].
+        previous_kick: kick of the previous iteration; zero in the first one [world, dof].
+        kick: what velocity terms add to the rates in half a step [world, dof].
+        path: the rates along which q moves [world, dof].
+        q: coordinates at the midpoint, at which kick and passes are evaluated [world, coordinate].
+        found: rates after the step [world, dof].
+        gained: what the passes add to the rates, over the length of the step [world, dof].
     """
 
-    before: wp.array
-    kicked: wp.array
+    previous_rates: wp.array
+    previous_kick: wp.array
     kick: wp.array
     path: wp.array
     q: wp.array
@@ -51,13 +63,13 @@ class Round(NamedTuple):
     gained: wp.array
 
     def step(self, q: wp.array) -> dict[str, wp.array]:
-        """Return what the passes of the round read for the coordinates ``q`` before the step, by name."""
+        """Return what the passes of the iteration read for the coordinates ``q`` before the step, by name."""
         return {"q": self.q, START: q, KICK: self.kick, PATH: self.path}
 
 
-def in_rounds(scene: Scene, passes: float) -> bool:
-    """Return whether a step of so many passes is made in rounds; one with pairs of bodies is not."""
-    return passes >= MANY and not scene.contact_pairs
+def uses_midpoint(scene: Scene, passes: float) -> bool:
+    """Return whether a step of so many passes uses the midpoint scheme; one with pairs of bodies does not."""
+    return passes >= MIDPOINT_PASSES and not scene.contact_pairs
 
 
 def step(
@@ -69,23 +81,23 @@ def step(
     qd: wp.array,
     **given: Any,
 ) -> None:
-    """Launch a step in rounds.
+    """Launch a step of the midpoint scheme.
 
     Args:
         ends: arrays for q and qd after it. more: further arrays to fill, by name. given: arguments of the step, with
             its "passes", "reports" and options.
     """
     (q_out, qd_out), status = ends, more.get("status")
-    q, qd = (  # the last kick reads both after q is stored
+    q, qd = (  # the final kick reads both after q is stored
         _copy(dyn, name, array) if any(array.ptr == end.ptr for end in ends) else array
         for name, array in (("q", q), ("qd", qd))
     )
     options: dict[str, Any] = {name: given.pop(name) for name in ("qdd", "status") if name in given}
     further = {"qdd_out": more["qdd_out"]} if "qdd" in options else {}
     last = run(dyn, dt, q, qd, given, more | {"q_out": q_out}, options)[-1]
-    state: dict[str, Any] = {"q": q, "qd": qd, "dt": dt, FOUND: last.found, KICKED: last.kick}
-    state |= {GAINED: last.gained, "qdd": True} if further else {}
-    dyn._engine.launch_routine(LAST_KICK, qd_out, further, **state)
+    state: dict[str, Any] = {"q": q, "qd": qd, "dt": dt, PREVIOUS_RATES: last.found, PREVIOUS_KICK: last.kick}
+    state |= {PASS_ACCELERATION: last.gained, "qdd": True} if further else {}
+    dyn._engine.launch_routine(FINAL_KICK, qd_out, further, **state)
     if status is not None:
         read = [last.found, last.kick, qd_out, UNSETTLED]
         dyn.recursions.launch(mark_unsettled, dyn.worlds, read, [status])
@@ -105,39 +117,51 @@ def run(
     more: dict[str, wp.array],
     options: dict[str, Any],
     gains: bool = False,
-) -> list[Round]:
-    """Launch the rounds of a step but for the last kick, and return them.
+) -> list[MidpointIteration]:
+    """Launch the iterations of a step without the final kick, and return them.
 
     Args:
-        given: arguments of the step. more: arrays that the last round fills, by name, for these ``options``.
-        gains: fill in :attr:`Round.gained` of all rounds.
+        given: arguments of the step. more: arrays that the last iteration fills, by name, for these ``options``.
+        gains: fill in :attr:`MidpointIteration.gained` in all iterations.
     """
-    made, launch = list[Round](), dyn._engine.launch_routine
+    iterations, launch = list[MidpointIteration](), dyn._engine.launch_routine
     given, reports = given | {"reports": ()}, given["reports"]
-    while len(made) < ROUNDS:
-        one = begin(dyn, dt, q, qd, made)
-        made.append(one)
+    while len(iterations) < ITERATIONS:
+        one = begin_iteration(dyn, dt, q, qd, iterations)
+        iterations.append(one)
         asked = {"q_out": dyn.recursions.array("q of a round", *q.shape)}
         chosen = {"qdd": True} if gains else {}
-        if len(made) == ROUNDS:
+        if len(iterations) == ITERATIONS:
             asked, given, chosen = asked | more, given | {"reports": reports}, chosen | options
         asked |= {"qdd_out": one.gained} if "qdd" in chosen else {}
         launch(CONTACT_STEP, one.found, asked, qd=qd, dt=dt, **one.step(q), **given, **chosen)
-    return made
+    return iterations
 
 
-def begin(dyn: Dynamics, dt: float, q: wp.array, qd: wp.array, made: list[Round]) -> Round:
-    """Launch the kick of the round after those that were ``made``, and return the round."""
+def begin_iteration(
+    dyn: Dynamics, dt: float, q: wp.array, qd: wp.array, iterations: list[MidpointIteration]
+) -> MidpointIteration:
+    """Launch the kick of the iteration that follows ``iterations``, and return it."""
 
     def array(name: str, like: wp.array) -> wp.array:
-        return dyn.recursions.array((name, len(made)), *like.shape)
+        return dyn.recursions.array((name, len(iterations)), *like.shape)
 
-    before, kicked = (made[-1].found, made[-1].kick) if made else (qd, array(KICKED, qd))
-    if not made:
-        launches.fill(kicked, 0)
-    one = Round(
-        before, kicked, array(KICK, qd), array(PATH, qd), array("q half way", q), array(FOUND, qd), array(GAINED, qd)
+    previous_rates, previous_kick = (
+        (iterations[-1].found, iterations[-1].kick) if iterations else (qd, array(PREVIOUS_KICK, qd))
+    )
+    if not iterations:
+        launches.fill(previous_kick, 0)
+    one = MidpointIteration(
+        previous_rates,
+        previous_kick,
+        array(KICK, qd),
+        array(PATH, qd),
+        array("q half way", q),
+        array(PREVIOUS_RATES, qd),
+        array(PASS_ACCELERATION, qd),
     )
     more = {"q_out": one.q, f"{PATH}_out": one.path}
-    dyn._engine.launch_routine(MIDDLE_KICK, one.kick, more, q=q, qd=qd, dt=dt, **{FOUND: before, KICKED: kicked})
+    dyn._engine.launch_routine(
+        FIRST_KICK, one.kick, more, q=q, qd=qd, dt=dt, **{PREVIOUS_RATES: previous_rates, PREVIOUS_KICK: previous_kick}
+    )
     return one

@@ -38,9 +38,8 @@ from ..operation import (
     required,
 )
 from ..trial_inputs import rotations
-from . import contact_gradients, integrators
-from . import contact_options as contacts
-from .integrators import INTEGRATORS, Interval
+from . import contact_gradients, contact_options, integrators
+from .integrators import INTEGRATORS, StepArrays
 from .midpoint_contact import INTEGRATE_VJP
 from .options import OPTIONS, REPORT, REPORTS, StepOptions, StepReport, check_names
 
@@ -92,7 +91,7 @@ def _without_gradient(dyn: Dynamics, arguments: dict[str, Any]) -> str:
         return "qdd is given; expected no qdd=, which the way back uses itself"
     if arguments.pop("actuator_state", None) is not None and actuators.delays_controls(dyn):
         return "actuators delay ctrl; expected a scene without delays, whose buffers have no gradients"
-    for name in ("status", *integrators.BODIES, *contacts.REPORTS):
+    for name in ("status", *integrators.BODIES, *contact_options.REPORTS):
         if arguments.get(name) is not None and arguments.get("substeps", 1) != 1:
             return f"{name} is given with substeps; expected one of the two"
         if getattr(arguments.get(name), "requires_grad", False):
@@ -188,8 +187,8 @@ def _step(
         outs = engine.outs(call, STEP, out)
         count = _take_substeps(call.name, {"substeps": substeps})
         reported = contact_f, contact_gap, contact_slip, contact_excess, contact_residual
-        asked = dict(zip(contacts.REPORTS, reported, strict=True))
-        taken = contacts.check_step(self, call, integrator, passes, asked)
+        asked = dict(zip(contact_options.REPORTS, reported, strict=True))
+        taken = contact_options.check_step(self, call, integrator, passes, asked)
         actuators.check_commands(self, call, ctrl, actuator_state, target_q)
         forces = {"tau": tau, "body_f": body_f, "target_q": target_q, "target_qd": target_qd, "ctrl": ctrl}
         written = {} if integrator != "semi_implicit" else {"qdd": qdd, "status": status}
@@ -202,8 +201,8 @@ def _step(
         given |= {} if taken is None else {"passes": taken, "reports": reports}
         given["bodies"] = integrators.arrays_of_bodies(self, states) if states else None
         q_out, qd_out = engine.write(call, STEP, outs, given)
-        interval = Interval(given["q"], given["qd"], q_out, qd_out, given["dt"])
-        given = {name: value for name, value in given.items() if name not in Interval._fields}
+        interval = StepArrays(given["q"], given["qd"], q_out, qd_out, given["dt"])
+        given = {name: value for name, value in given.items() if name not in StepArrays._fields}
         _launch(self, call, integrator, count, interval, given, buffers)
     return call.result
 
@@ -270,7 +269,7 @@ def step_report(self: Dynamics, *names: str, like: Any = None) -> StepReport:
     check_names(title, names)
     axes = {one.name: one.axes for one in STEP.arrays if one.written}
     kind = WARP if like is None else kind_of(like, title, "like")
-    with Call(title, self.device, self.dtype, kind=kind, turn=self.recursions.turn) as call:
+    with Call(title, self.device, self.dtype, kind=kind, call_order=self.recursions.call_order) as call:
         for name in names:
             launches.fill(call.write(None, *self._engine.shape(axes[name])), 0)
     arrays = call.result if len(names) > 1 else [call.result] * len(names)
@@ -287,7 +286,7 @@ def _launch(
     call: Call,
     integrator: str,
     count: int,
-    interval: Interval,
+    interval: StepArrays,
     given: dict[str, Any],
     buffers: tuple[wp.array, wp.array] | None,
 ) -> None:
@@ -313,7 +312,7 @@ def _launch(
             given["status"] = dyn._later_status
         INTEGRATORS[integrator](dyn, call, interval, **given, **(last if substep == count - 1 else {}), ctrl=now)
         if force is not None:
-            contacts.add_share(dyn, substep, count, given["reports"]["contact_f"], force)
+            contact_options.add_share(dyn, substep, count, given["reports"]["contact_f"], force)
         if substep and status is not None:
             dyn.recursions.launch(combination.worst, dyn.worlds, [SEVERITY, dyn._later_status], [status])
         interval = interval._replace(q=interval.q_out, qd=interval.qd_out)

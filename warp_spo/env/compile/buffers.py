@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from .fused_kernel import CHOSEN, COLUMN, INT, LONG, ROW, SHARED, Buffer
-from .memory_layout import Layout
+from .fused_kernel import COLUMN, INT, LONG, MASK, ROW, SHARED, Buffer
+from .memory_layout import MemoryLayout
 
 CONTACT_ARRAYS = {"contact_f": 3, "contact_gap": 1, "contact_slip": 1}  # entries of each point, and of each pair
 LINE = 32  # scalars of a line of the caches
@@ -32,7 +32,7 @@ class Storage:
 
     def __init__(
         self,
-        layout: Layout,
+        layout: MemoryLayout,
         worlds: int,
         device: torch.device,
         read: set[str],
@@ -64,25 +64,25 @@ class Storage:
     def changing(self) -> dict[str, torch.Tensor]:
         """Return the tensors that steps change, by name; "out" holds all results."""
         results = {self._output(name) for name in self.places}
-        own = {name for name, buffer in self.buffers.items() if buffer.way != SHARED} | {"key"}
+        own = {name for name, buffer in self.buffers.items() if buffer.memory_order != SHARED} | {"key"}
         return {name: x for name, x in self.tensors.items() if name in own - results} | {"out": self.out}
 
     @property
     def bytes_per_world(self) -> int:
         """Bytes that a world takes, without what all worlds share."""
-        own = (buffer.tensor.nbytes for buffer in self.buffers.values() if buffer.way != SHARED)
+        own = (buffer.tensor.nbytes for buffer in self.buffers.values() if buffer.memory_order != SHARED)
         return sum(own) // self.worlds
 
     # -- inside ----------------------------------------------------------------------------------------------------
     def _zeros(self, *shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
         return torch.zeros(shape, dtype=dtype, device=self.device)
 
-    def _add(self, name: str, tensor: torch.Tensor, way: str = ROW) -> torch.Tensor:
+    def _add(self, name: str, tensor: torch.Tensor, memory_order: str = ROW) -> torch.Tensor:
         self.tensors[name] = tensor
-        self.buffers[name] = Buffer(tensor.view(self.worlds, -1) if way == ROW else tensor, way)
+        self.buffers[name] = Buffer(tensor.view(self.worlds, -1) if memory_order == ROW else tensor, memory_order)
         return tensor
 
-    def _add_state(self, layout: Layout) -> None:
+    def _add_state(self, layout: MemoryLayout) -> None:
         worlds, scene = self.worlds, layout.scene
         default = torch.tensor(layout.default_q, dtype=torch.float32, device=self.device)
         self._add("q", default.repeat(worlds, 1))
@@ -93,9 +93,9 @@ class Storage:
         self._add("key", self._zeros(3, dtype=torch.int32), SHARED)
         self._add("advance", self._zeros(1) + 1.0, SHARED)
         self._add("episode_length", self._zeros(worlds, dtype=torch.int64), LONG)
-        self._add("chosen", self._zeros(worlds, dtype=torch.bool), CHOSEN)
+        self._add("chosen", self._zeros(worlds, dtype=torch.bool), MASK)
 
-    def _add_controls(self, layout: Layout, read: set[str]) -> None:
+    def _add_controls(self, layout: MemoryLayout, read: set[str]) -> None:
         scene = layout.scene
         sizes = {"ctrl": len(scene.actuators), "tau": scene.dof_count, "target_q": scene.coord_count}
         for name in sorted(layout.action_arrays):
@@ -105,7 +105,7 @@ class Storage:
         if "actuator_force" in read:
             self._add("actuator_force", self._zeros(self.worlds, scene.dof_count))
 
-    def _add_measured(self, layout: Layout, read: set[str]) -> None:
+    def _add_measured(self, layout: MemoryLayout, read: set[str]) -> None:
         """Add what the dynamics write: contacts, frames."""
         worlds, points, frames = self.worlds, layout.scene.contact_count, len(layout.frames)
         for name, each in CONTACT_ARRAYS.items():
@@ -119,7 +119,7 @@ class Storage:
             self.written["qdd"] = self._zeros(worlds, layout.scene.dof_count)
             self._add("frame_acceleration", self._zeros(worlds, frames, 6))
 
-    def _add_numbers(self, layout: Layout, tables: Mapping[str, torch.Tensor]) -> None:
+    def _add_numbers(self, layout: MemoryLayout, tables: Mapping[str, torch.Tensor]) -> None:
         """Add tables that all worlds share, values that events change, and what users compute in torch."""
         for name, table in tables.items():
             self._add(name, table.reshape(-1), SHARED)

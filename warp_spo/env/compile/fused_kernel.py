@@ -1,4 +1,4 @@
-"""Stages: the work of an environment on one world as one traced kernel, or on each of many rows of numbers."""
+"""Fused kernels: the work of an environment on one world as one traced kernel, or on each of many rows of numbers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ...runtime import launches
 from ...trace.emission import Emitter, Listing, RangeReduction, Store, render, replaces
 from ...trace.scalars import BRANCHES, Graph, Scalar, ordered
 
-ROW, COLUMN, INT, LONG, CHOSEN, SHARED = "row", "column", "int", "long", "chosen", "shared"
+ROW, COLUMN, INT, LONG, MASK, SHARED = "row", "column", "int", "long", "chosen", "shared"
 DRAW = "draw"  # random numbers of the thread's own
 ROW_NUMBER = "row_number"  # of the thread, where a world has many
 ROWS_AT_ONCE = 4  # of a thread, which share what is the same for all
@@ -27,14 +27,15 @@ class Buffer(NamedTuple):
 
     Attributes:
         tensor: torch tensor; its memory is the array's.
-        way: ROW: float32 [world, entry]. COLUMN: float32 [entry, world], which neighbouring threads read side by side.
-            SHARED: float32 [entry], the same for all worlds. INT: int32 [world]. LONG: int64 [world]. CHOSEN: bool
+        memory_order: ROW: float32 [world, entry]. COLUMN: float32 [entry, world],
+            which neighbouring threads read side by side.
+            SHARED: float32 [entry], the same for all worlds. INT: int32 [world]. LONG: int64 [world]. MASK: bool
             [world].
         passes: it is large, and no kernel reads it: it shall not displace from the caches what others read.
     """
 
     tensor: Any
-    way: str = ROW
+    memory_order: str = ROW
     passes: bool = False
 
     @property
@@ -44,26 +45,26 @@ class Buffer(NamedTuple):
 
     def place(self, name: str, entry: str) -> str:
         """Return C++ for an entry in the thread's world."""
-        entries = self.tensor.shape[-1] if self.way == ROW else 0
+        entries = self.tensor.shape[-1] if self.memory_order == ROW else 0
         return {
             ROW: f"{name}.data[world * {entries} + {entry}]",
             COLUMN: f"{name}.data[(long long)({entry}) * worlds + world]",
             SHARED: f"{name}.data[{entry}]",
             INT: f"((int*){name}.data)[world]",
             LONG: f"((long long*){name}.data)[world]",
-            CHOSEN: f"{name}.data[world]",
-        }[self.way]
+            MASK: f"{name}.data[world]",
+        }[self.memory_order]
 
     def load(self, name: str, entry: str) -> str:
         """Return C++ that reads an entry as float."""
         place = self.place(name, entry)
-        return place if self.way in (ROW, COLUMN, SHARED) else f"(float)({place})"
+        return place if self.memory_order in (ROW, COLUMN, SHARED) else f"(float)({place})"
 
     def store(self, name: str, entry: str, value: str) -> str:
         """Return C++ that writes an entry."""
         if self.passes:
             return f"{self.set}({self.place(name, entry)}, {value});"
-        kind = {INT: "(int)", LONG: "(long long)", CHOSEN: "0 != "}.get(self.way, "")
+        kind = {INT: "(int)", LONG: "(long long)", MASK: "0 != "}.get(self.memory_order, "")
         return f"{self.place(name, entry)} = {kind}({value});"
 
     def warp(self) -> Any:
@@ -71,12 +72,12 @@ class Buffer(NamedTuple):
         import torch
 
         flat = self.tensor.reshape(-1)[:MOST_ENTRIES]  # kernels take its address alone
-        if self.way == CHOSEN:
+        if self.memory_order == MASK:
             return wp.from_torch(flat, dtype=wp.bool)
         return wp.from_torch(flat.view(torch.float32), dtype=wp.float32)
 
 
-class Stage:
+class FusedKernel:
     """One kernel, a thread a world or a row of a world, made of the values that terms store.
 
     Args:
@@ -123,7 +124,7 @@ class Stage:
         """Return the names of the arrays that the stored values depend on."""
         return {scalar.args[0] for scalar in ordered(item.value for item in self.stores) if scalar.op == "input"}
 
-    def overwrites(self, other: Stage) -> bool:
+    def overwrites(self, other: FusedKernel) -> bool:
         """Return whether it writes an entry that another stage reads."""
         read = {scalar.args for scalar in ordered(item.value for item in other.stores) if scalar.op == "input"}
         return any((item.array, *item.index) in read for item in self.stores)
@@ -137,7 +138,7 @@ class Stage:
         read = self.read_arrays()
         stored: dict[str, set[int]] = {}
         for item in self.stores:
-            if buffers[item.array].way == ROW and item.array not in read and not self.rows:
+            if buffers[item.array].memory_order == ROW and item.array not in read and not self.rows:
                 stored.setdefault(item.array, set()).add(item.index[0])
         found = {}
         for name, entries in stored.items():

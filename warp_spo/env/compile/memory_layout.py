@@ -10,7 +10,7 @@ from ...scene.scene import Scene
 from .vectors import find
 
 
-class Layout:
+class MemoryLayout:
     """The arrangement of an environment's arrays.
 
     Attributes:

@@ -17,8 +17,8 @@ from ...trace.scalars import Value, absolute, branch, less
 from ..events import EncoderBias, Interval, Reset, Start, Values
 from ..observations import Observation, name_of
 from ..world import World
-from .fused_kernel import Stage
-from .memory_layout import Layout
+from .fused_kernel import FusedKernel
+from .memory_layout import MemoryLayout
 from .vectors import Vector, as_condition, as_value, vector
 
 LARGEST = 1e30  # numbers beyond it count as not finite
@@ -46,7 +46,7 @@ class Tracing:
 
     def __init__(
         self,
-        layout: Layout,
+        layout: MemoryLayout,
         actions: list,
         groups: dict[str, list[Observation]],
         rewards: dict[str, tuple[float, Any]],
@@ -65,10 +65,10 @@ class Tracing:
                     raise ValueError(
                         "Env: events has two encoder_bias; expected one, whose names= are several expressions"
                     )
-                layout.biased = World(layout, Stage("none", 0)).joints(event.names)
+                layout.biased = World(layout, FusedKernel("none", 0)).joints(event.names)
         self.ends = [*terminations, NOT_FINITE]
         names = ("act", "judge", "observe", "reset", "start", "final")
-        self.stages = {name: Stage(name, stream) for stream, name in enumerate(names)}
+        self.stages = {name: FusedKernel(name, stream) for stream, name in enumerate(names)}
         self.group_sizes: dict[str, int] = {}
         self.term_sizes: dict[str, list[int]] = {}  # of each group's terms, in their order
         self.apart: set[str] = set()
@@ -290,7 +290,7 @@ class Tracing:
     def _observe(self) -> None:
         stage = self.stages["observe"]
 
-        def begin(one: Stage) -> World:
+        def begin(one: FusedKernel) -> World:
             one.late = f"advance.data[0] > 0 || {CHOSEN_WORLD} ? 1u : 0u"
             return World(self.layout, one, fresh=Condition(one.graph.input("chosen", 0)))
 
@@ -300,14 +300,14 @@ class Tracing:
     def _final(self) -> None:
         """Observe the state in which an episode ends, before worlds start anew."""
 
-        def begin(stage: Stage) -> World:
+        def begin(stage: FusedKernel) -> World:
             w = World(self.layout, stage)
             w.__dict__["time"] = (w.read("episode_length", 1)[0] + 1.0) * self.layout.step_dt
             return w
 
         self._observe_groups(begin(self.stages["final"]), begin, "final ")
 
-    def _observe_groups(self, w: World, begin: Callable[[Stage], World], kind: str) -> None:
+    def _observe_groups(self, w: World, begin: Callable[[FusedKernel], World], kind: str) -> None:
         """Store the observations of all groups: of ``w``, or of the rows of a world that ``begin`` makes of a stage."""
         of_rows: dict[int, World] = {}
         for group, terms in self.groups.items():
@@ -317,7 +317,7 @@ class Tracing:
                 if rows:
                     self.apart.add(kind + group)
                     if rows not in of_rows:
-                        stage = Stage(w._stage.name, len(self.stages), rows)
+                        stage = FusedKernel(w._stage.name, len(self.stages), rows)
                         self.stages[f"{w._stage.name}, {rows} rows"] = stage
                         of_rows[rows] = begin(stage)
                     one, stage = of_rows[rows], of_rows[rows]._stage

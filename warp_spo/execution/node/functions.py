@@ -19,9 +19,9 @@ from ...kernels.elementary import C_TYPE, NATIVE
 from ...kernels.spatial import spatial
 from ...recursions import articulated, kinematics, motion, newton_euler
 from ...recursions.articulated import Pivot
-from ...recursions.model.links import Placed
+from ...recursions.model.links import LinkPlacement
 from ...recursions.model.tracing import EPSILON
-from ...recursions.motion import STILL, Motion
+from ...recursions.motion import STILL, VelocityTerms
 from ...trace.emission import Emitter, Store, render
 from ...trace.scalars import Graph, Value, reciprocal
 from ...trace.spatial import Articulated, Matrix, Pose, Rigid, Vector, magnitude
@@ -47,9 +47,9 @@ RIGID, INERTIA = ArgumentKind(10, Rigid.unpacked), ArgumentKind(21, Articulated.
 MOVING = ArgumentKind(6, lambda x: STILL._replace(spin=Vector(x[:3]), whirl=motion.whirl(x)))
 
 
-def _node_acceleration(pose: Pose, above: Motion, alpha: tuple, own: tuple, bias: Vector) -> Vector:
+def _node_acceleration(pose: Pose, above: VelocityTerms, alpha: tuple, own: tuple, bias: Vector) -> Vector:
     move = motion.compose_motions(pose, above, *own)
-    w, v = motion.carry_acceleration(Placed(pose, None), move, alpha)
+    w, v = motion.carry_acceleration(LinkPlacement(pose, None), move, alpha)
     return Vector((*(w + move.bias_w), *(v + move.bias_v))) + bias
 
 
@@ -85,7 +85,7 @@ NODE_FUNCTIONS: dict[str, tuple[Callable, dict[str, ArgumentKind]]] = {
     # velocity of a point and angular velocity, in inertial axes
     "motion_to_child": (lambda pose, v: pose.motion_to_child(*v), {"pose": PLACE, "v": PARTS}),
     "node_velocity": (
-        lambda pose, above, own: kinematics.carried_velocity(Placed(pose, None), above, own),
+        lambda pose, above, own: kinematics.carried_velocity(LinkPlacement(pose, None), above, own),
         {"pose": PLACE, "above": PARTS, "own": PARTS},
     ),
     "node_acceleration": (

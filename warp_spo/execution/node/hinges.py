@@ -75,7 +75,7 @@ def names(moves: bool) -> list[str]:
 
 def _stores(graph: Graph, link: Link, moves: bool) -> list[Store]:
     hinge, node = link.hinge, link.node
-    place = hinge.placed(link, lambda i: graph.input("q", i))
+    place = hinge.transform(link, lambda i: graph.input("q", i))
     rows = np.reshape([graph.input("tree", POSE * node + i) for i in range(POSE)], (4, 3)).tolist()
     tree = Pose(None, Matrix.of(rows[:3]), Vector(rows[3]))
     rotation = tree.rotation @ place.pose.rotation

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ...kernels import articulated, declare, kinematics
-from ...kernels import body_sums as sums
+from ...kernels import articulated, body_sums, declare, kinematics
 from .sweeps import Sweeps
 
 
@@ -97,24 +96,24 @@ def frame_velocities(run: Sweeps, out: wp.array, q: wp.array, qd: wp.array, fram
 
 
 def com(run: Sweeps, out: wp.array, q: wp.array) -> None:
-    declare(sums, run.functions)
+    declare(body_sums, run.functions)
     run.hinges(q)
     inputs = [run.topology, run.parameters.rigid, run.world_poses()]
-    run.launch_nodes(sums.center_of_mass, run.worlds, inputs, [out])
+    run.launch_nodes(body_sums.center_of_mass, run.worlds, inputs, [out])
 
 
 def com_velocity(run: Sweeps, out: wp.array, q: wp.array, qd: wp.array) -> None:
-    declare(sums, run.functions)
+    declare(body_sums, run.functions)
     run.hinges(q, qd)
     inputs = [run.topology, run.parameters.rigid, run.world_poses(), run.velocities()]
-    run.launch_nodes(sums.center_of_mass_velocity, run.worlds, inputs, [out])
+    run.launch_nodes(body_sums.center_of_mass_velocity, run.worlds, inputs, [out])
 
 
 def kinetic_energy(run: Sweeps, out: wp.array, q: wp.array, qd: wp.array) -> None:
-    declare(sums, run.functions)
+    declare(body_sums, run.functions)
     run.hinges(q, qd)
     inputs = [run.parameters.rigid, run.velocities(), run.parameters.field("joint_armature"), qd]
-    run.launch_nodes(sums.kinetic_energy, run.worlds, inputs, [out])
+    run.launch_nodes(body_sums.kinetic_energy, run.worlds, inputs, [out])
 
 
 def jacobian(run: Sweeps, out: wp.array, q: wp.array, frames: tuple) -> None:

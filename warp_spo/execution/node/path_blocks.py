@@ -1,9 +1,9 @@
-"""Cuts a tree into paths, and paths into stretches of a few nodes, for work that is parallel in depth.
+"""Decompose a tree into paths, and paths into blocks of a few nodes, for work that is parallel in depth.
 
 A path leads from a node inward along the heaviest children (Sleator and Tarjan's heavy paths). Paths that end
 on a path must be finished first, so paths have levels: no path ends on one of level 0; a tree of n nodes has at most
-log2(n) + 1 levels. A stretch is a run of consecutive nodes of a path. A node with several children is the outermost
-node of its stretch.
+log2(n) + 1 levels. A block is a run of consecutive nodes of a path. A node with several children is the outermost
+node of its block.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from ...hinges.hinge_type import SCREWS
 from ...scene.scene import Scene
 from ...scene.tree import Tree
 
-SOLID = 1e-6  # least share of a body's largest moment of inertia that lets its hinge begin a stretch
+SOLID = 1e-6  # least share of a body's largest moment of inertia that lets its hinge begin a block
 
 
-class Level(NamedTuple):
-    """The stretches of the paths of one level: the first, how many, and the most on one path."""
+class PathLevel(NamedTuple):
+    """The blocks of the paths of one level: the first, how many, and the most on one path."""
 
     first: int
     size: int
@@ -34,22 +34,22 @@ class Level(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Cut:
-    """A tree in stretches, path by path, from the outermost stretch of a path to the innermost.
+class PathDecomposition:
+    """A tree in blocks, path by path, from the outermost block of a path to the innermost.
 
     Attributes:
-        nodes: of each stretch, the outermost first.
-        position: stretches further out on the same path [stretch].
-        feed: child of the outermost node on its path, -1 where the path begins [stretch].
-        tree: the tree of stretches. A stretch hangs on the outermost node of its parent.
+        nodes: of each block, the outermost first.
+        position: blocks further out on the same path [block].
+        path_child: child of the outermost node on its path, -1 where the path begins [block].
+        tree: the tree of blocks. A block hangs on the outermost node of its parent.
         levels: of paths, in the order of an inward scan.
     """
 
     nodes: tuple[tuple[int, ...], ...]
     position: tuple[int, ...]
-    feed: tuple[int, ...]
+    path_child: tuple[int, ...]
     tree: Tree
-    levels: tuple[Level, ...]
+    levels: tuple[PathLevel, ...]
 
     @property
     def launches(self) -> int:
@@ -64,38 +64,38 @@ def rounds(count: int) -> int:
     return (count - 1).bit_length()
 
 
-def cut(tree: Tree, solid: np.ndarray, length: int) -> Cut:
-    """Return a tree in stretches of ``length`` nodes, longer ones where a node is not solid.
+def decompose(tree: Tree, solid: np.ndarray, length: int) -> PathDecomposition:
+    """Return a tree in blocks of ``length`` nodes, longer ones where a node is not solid.
 
     Args:
-        solid: [node], whether the node's hinge feels inertia when nothing further out pushes back. A stretch that
+        solid: [node], whether the node's hinge feels inertia when nothing further out pushes back. A block that
             receives something begins at such a node.
     """
     paths, level_of = _paths(tree, solid)
     order = sorted(range(len(paths)), key=level_of.__getitem__)
     nodes: list[tuple[int, ...]] = []
     position: list[int] = []
-    levels: list[Level] = []
+    levels: list[PathLevel] = []
     for path in order:
         first = len(nodes)
-        stretch: list[int] = []
+        path_block: list[int] = []
         for node in paths[path]:
-            if stretch and (len(tree.children[node]) > 1 or (len(stretch) >= length and solid[node])):
-                nodes.append(tuple(stretch))
-                stretch = []
-            stretch.append(node)
-        nodes.append(tuple(stretch))
+            if path_block and (len(tree.children[node]) > 1 or (len(path_block) >= length and solid[node])):
+                nodes.append(tuple(path_block))
+                path_block = []
+            path_block.append(node)
+        nodes.append(tuple(path_block))
         count = len(nodes) - first
         position += range(count)
         if level_of[path] == len(levels):
-            levels.append(Level(first, 0, 0))
+            levels.append(PathLevel(first, 0, 0))
         last = levels[-1]
         levels[-1] = last._replace(size=last.size + count, longest=max(last.longest, count))
-    stretch_of = {node: index for index, stretch in enumerate(nodes) for node in stretch}
-    innermost = [tree.parent[stretch[-1]] for stretch in nodes]
-    feed = [nodes[index - 1][-1] if at else -1 for index, at in enumerate(position)]
-    parents = Tree([stretch_of[parent] if parent >= 0 else -1 for parent in innermost])
-    return Cut(tuple(nodes), tuple(position), tuple(feed), parents, tuple(levels))
+    block_of = {node: index for index, path_block in enumerate(nodes) for node in path_block}
+    innermost = [tree.parent[path_block[-1]] for path_block in nodes]
+    path_child = [nodes[index - 1][-1] if at else -1 for index, at in enumerate(position)]
+    parents = Tree([block_of[parent] if parent >= 0 else -1 for parent in innermost])
+    return PathDecomposition(tuple(nodes), tuple(position), tuple(path_child), parents, tuple(levels))
 
 
 def _paths(tree: Tree, solid: np.ndarray) -> tuple[list[list[int]], list[int]]:

@@ -1,11 +1,11 @@
 """Sweeps in few rounds: the sweeps of :mod:`.sweeps` as scans along paths, for deep trees in few worlds.
 
-Each method leaves in the workspace what the sweep of that name leaves there. A thread works through a stretch of nodes,
-see :mod:`.stretches`; between stretches,
+Each method leaves in the workspace what the sweep of that name leaves there. A thread works through a block of nodes,
+see :mod:`.path_blocks`; between blocks,
 
-* motion outward: relative motions are composed along ancestors 1, 2, 4, ... stretches further in,
+* motion outward: relative motions are composed along ancestors 1, 2, 4, ... blocks further in,
 * P inward: elements (A, C, J) are combined along each path, a level of paths after the other,
-* z inward and alpha outward: (I - E)^-1 and its transpose by doubling, E = psi through each stretch,
+* z inward and alpha outward: (I - E)^-1 and its transpose by doubling, E = psi through each block,
 * f inward: the same with phi.
 """
 
@@ -19,12 +19,12 @@ import numpy as np
 import warp as wp
 
 from ...graph.blocks import new_weights
-from ...graph.doubling import Doubling, Round
+from ...graph.doubling import Doubling, DoublingRound
 from ...kernels import declare, scan_articulated, scan_forces, scan_motion, scan_solve
 from ...kernels.spatial import ARTICULATED, MOTION, POSE
-from ...kernels.topology import Stretches
+from ...kernels.topology import PathBlocks
 from ...runtime import launches
-from .path_blocks import Cut, cut, solid_nodes
+from .path_blocks import PathDecomposition, decompose, solid_nodes
 
 if TYPE_CHECKING:
     from .sweeps import Sweeps
@@ -38,7 +38,7 @@ class Scan:
 
     Args:
         run: the sweeps of the scene, whose workspace and parameters the scans use.
-        length: nodes of a stretch.
+        length: nodes of a block.
     """
 
     def __init__(self, run: Sweeps, length: int):
@@ -48,18 +48,18 @@ class Scan:
         self.replace_values()
 
     def replace_values(self) -> None:
-        """Cut the tree anew; which nodes may begin a stretch depends on the scene's inertias."""
+        """Decompose the tree anew; which nodes may begin a block depends on the scene's inertias."""
         run = self._run
-        self.cut = cut(run.scene.tree, solid_nodes(run.scene), self._length)
-        self._stretches = _tables(self.cut, run.device)
+        self.paths = decompose(run.scene.tree, solid_nodes(run.scene), self._length)
+        self._path_blocks = _tables(self.paths, run.device)
         self._through_psi = self._weights_and_resolvent()
         self.__dict__.pop("_through_phi", None)
 
     def _weights_and_resolvent(self) -> tuple[Doubling, wp.array]:
-        """Return new weights of the tree of stretches, a block for each that hangs on another, and their resolvent."""
-        run, count = self._run, len(self.cut.nodes)
-        offsets = [BLOCK * stretch for stretch in range(count)]
-        doubling = Doubling(self.cut.tree, [MOTION] * count, offsets, run.worlds, run.dtype, run.device)
+        """Return new weights of the tree of blocks, a block for each that hangs on another, and their resolvent."""
+        run, count = self._run, len(self.paths.nodes)
+        offsets = [BLOCK * path_block for path_block in range(count)]
+        doubling = Doubling(self.paths.tree, [MOTION] * count, offsets, run.worlds, run.dtype, run.device)
         return doubling, new_weights(run.worlds, BLOCK * count, run.dtype, run.device)
 
     @functools.cached_property
@@ -67,31 +67,31 @@ class Scan:
         return self._weights_and_resolvent()
 
     @property
-    def _rounds(self) -> list[Round]:
-        """The rounds along the tree of stretches; none if no stretch hangs on another one."""
+    def _rounds(self) -> list[DoublingRound]:
+        """The rounds along the tree of blocks; none if no block hangs on another one."""
         return self._through_psi[0].rounds
 
     def _launch(self, factory: Callable, dim: tuple[int, ...], inputs: list, outputs: list) -> None:
         run, size = self._run, (*dim, self._run.worlds)
         launches.launch(factory(run.functions), size, inputs, outputs, device=run.device, block_dim=THREADS)
 
-    def _per_stretch(self, name: str, components: int, use: int) -> wp.array:
-        count = len(self.cut.nodes)
+    def _per_block(self, name: str, components: int, use: int) -> wp.array:
+        count = len(self.paths.nodes)
         return self._run.array(("scan", name, use, count), count, components, self._run.worlds)
 
     # -- motion ----------------------------------------------------------------------------------------------------
     def _end_motion(self, qdd: wp.array | None, velocity: wp.array | None, bias: Any, accelerates: bool) -> list:
-        """Return pose, velocity and acceleration of each stretch's outermost node, relative to the inertial frame."""
-        run, count = self._run, len(self.cut.nodes)
+        """Return pose, velocity and acceleration of each block's outermost node, relative to the inertial frame."""
+        run, count = self._run, len(self.paths.nodes)
         moves, parts = velocity is not None, {"pose": POSE, "velocity": MOTION, "acceleration": MOTION}
         present = {"pose": True, "velocity": moves, "acceleration": accelerates}
         now, following = (
-            [self._per_stretch(name, size, use) if present[name] else None for name, size in parts.items()]
+            [self._per_block(name, size, use) if present[name] else None for name, size in parts.items()]
             for use in (0, 1)
         )
-        if not self._rounds:  # no stretch hangs on another one, and nobody reads these
+        if not self._rounds:  # no block hangs on another one, and nobody reads these
             return now
-        inputs = [run.topology, self._stretches, run.array("pose"), run.array("axis"), velocity, bias, qdd]
+        inputs = [run.topology, self._path_blocks, run.array("pose"), run.array("axis"), velocity, bias, qdd]
         self._launch(scan_motion.relative_motion, (count,), inputs, now)
         for one in self._rounds:
             self._launch(scan_motion.compose_motions, (count,), [one.tables.ancestor, *now], following)
@@ -109,30 +109,30 @@ class Scan:
         """Compute V and alpha of every node, in arrays [node, 6, world]; ``velocity`` holds H* qd before."""
         run = self._run
         ends = self._end_motion(qdd, velocity, bias, acceleration is not None)
-        inputs = [run.topology, self._stretches, *ends, run.array("pose"), run.array("axis"), bias, gravity, qdd]
-        self._launch(scan_motion.node_motion, (len(self.cut.nodes),), inputs, [velocity, acceleration])
+        inputs = [run.topology, self._path_blocks, *ends, run.array("pose"), run.array("axis"), bias, gravity, qdd]
+        self._launch(scan_motion.node_motion, (len(self.paths.nodes),), inputs, [velocity, acceleration])
 
     def world_poses(self, out: wp.array) -> None:
         """Compute the pose of every node frame in the inertial frame."""
         pose, *_ = self._end_motion(None, None, None, False)
-        inputs = [self._stretches, pose, self._run.array("pose")]
-        self._launch(scan_motion.world_poses, (len(self.cut.nodes),), inputs, [out])
+        inputs = [self._path_blocks, pose, self._run.array("pose")]
+        self._launch(scan_motion.world_poses, (len(self.paths.nodes),), inputs, [out])
 
     # -- factors and solutions -------------------------------------------------------------------------------------
     def factor(self, inputs: list, outputs: list) -> None:
-        """Compute P+, U and D of every node, and psi through every stretch.
+        """Compute P+, U and D of every node, and psi through every block.
 
         ``inputs`` and ``outputs`` are those of the kernel ``articulated.factor`` after its level.
         """
         run, (doubling, psi) = self._run, self._through_psi
-        for first, count, longest in self.cut.levels:
-            places = [run.topology, self._stretches, first]
+        for first, count, longest in self.paths.levels:
+            places = [run.topology, self._path_blocks, first]
             now, following = self._elements(0), self._elements(1)
             if longest > 1:
                 self._launch(scan_articulated.element, (count,), [*places, *inputs, outputs[0]], now)
             shift = 1
-            while shift < longest - 1:  # nothing hangs on the innermost stretch of a path
-                self._launch(scan_articulated.combine, (count,), [self._stretches, first, shift, *now], following)
+            while shift < longest - 1:  # nothing hangs on the innermost block of a path
+                self._launch(scan_articulated.combine, (count,), [self._path_blocks, first, shift, *now], following)
                 now, following, shift = following, now, 2 * shift
             self._launch(scan_articulated.factor, (count,), [*places, *inputs, now[1]], [*outputs, psi])
         doubling.square(psi)
@@ -140,16 +140,16 @@ class Scan:
     def _elements(self, use: int) -> list[wp.array]:
         """Return the arrays of A, one row for each of its columns, C and J."""
         A = self._run.array(
-            ("scan", "A", use, len(self.cut.nodes)), MOTION * len(self.cut.nodes), MOTION, self._run.worlds
+            ("scan", "A", use, len(self.paths.nodes)), MOTION * len(self.paths.nodes), MOTION, self._run.worlds
         )
-        return [A, *(self._per_stretch(name, ARTICULATED, use) for name in "CJ")]
+        return [A, *(self._per_block(name, ARTICULATED, use) for name in "CJ")]
 
     def eliminate(self, columns: tuple[int, int], inputs: list, out: wp.array) -> None:
         """Write D^-1 [I - H psi K] (b - H phi force) into ``out`` [world, dof, column]; after :meth:`factor`.
 
         ``columns`` is (first, count); ``inputs`` are those of the kernel ``articulated.eliminate`` after its column.
         """
-        dim, places = (len(self.cut.nodes), columns[1]), [self._run.topology, self._stretches, columns[0]]
+        dim, places = (len(self.paths.nodes), columns[1]), [self._run.topology, self._path_blocks, columns[0]]
         leaving, incoming = self._vector(0, columns[1]), self._vector(1, columns[1])
         if self._rounds:
             self._launch(scan_solve.eliminate, dim, [*places, *inputs, None], [leaving, out])
@@ -158,7 +158,7 @@ class Scan:
 
     def back_substitute(self, columns: tuple[int, int], inputs: list, out: wp.array) -> None:
         """Write [I - H psi K]* out into ``out``; ``inputs`` are those of ``articulated.back_substitute``."""
-        dim, places = (len(self.cut.nodes), columns[1]), [self._run.topology, self._stretches, columns[0]]
+        dim, places = (len(self.paths.nodes), columns[1]), [self._run.topology, self._path_blocks, columns[0]]
         leaving, incoming = self._vector(0, columns[1]), self._vector(1, columns[1])
         if self._rounds:
             self._launch(scan_solve.back_substitute, dim, [*places, *inputs, None], [leaving, out])
@@ -167,14 +167,14 @@ class Scan:
 
     def hinge_forces(self, inputs: list, force: wp.array, out: wp.array) -> None:
         """Write H phi force + Delta qdd into ``out`` [world, dof]; ``inputs`` are those of ``newton_euler.force``."""
-        run, count = self._run, (len(self.cut.nodes),)
-        places, leaving, incoming = [run.topology, self._stretches], self._vector(0, 1), self._vector(1, 1)
+        run, count = self._run, (len(self.paths.nodes),)
+        places, leaving, incoming = [run.topology, self._path_blocks], self._vector(0, 1), self._vector(1, 1)
         if self._rounds:
             doubling, phi = self._through_phi
-            pose = self._per_stretch("pose", POSE, 0)
+            pose = self._per_block("pose", POSE, 0)
             arguments = [*places, run.array("pose"), run.array("axis"), None, None, None]
             self._launch(scan_motion.relative_motion, count, arguments, [pose, None, None])
-            self._launch(scan_forces.phi_of_stretches, count, [self._stretches, pose], [phi])
+            self._launch(scan_forces.phi_of_stretches, count, [self._path_blocks, pose], [phi])
             doubling.square(phi)
             self._launch(scan_forces.carry_forces, count, [*places, *inputs, None], [leaving, force, out])
             self._resolve(self._through_phi, leaving, incoming)
@@ -187,20 +187,20 @@ class Scan:
         doubling.apply(weights, x, out, take, transposed=transposed)
 
     def _vector(self, use: int, columns: int) -> wp.array:
-        """Return a vector of the tree of stretches [world, 6 stretch + component, column], worlds as neighbours."""
-        shape = MOTION * len(self.cut.nodes), columns, self._run.worlds
+        """Return a vector of the tree of blocks [world, 6 block + component, column], worlds as neighbours."""
+        shape = MOTION * len(self.paths.nodes), columns, self._run.worlds
         return self._run.array(("scan", "x", use, *shape), *shape).transpose((2, 0, 1))
 
 
-def _tables(cut: Cut, device: wp.Device) -> Any:
-    children = cut.tree.children
-    tables: Any = Stretches()
+def _tables(paths: PathDecomposition, device: wp.Device) -> Any:
+    children = paths.tree.children
+    tables: Any = PathBlocks()
     lists = {
-        "first": np.cumsum([0, *map(len, cut.nodes)]),
-        "nodes": [node for stretch in cut.nodes for node in stretch],
-        "position": cut.position,
-        "feed": cut.feed,
-        "parent": cut.tree.parent,
+        "first": np.cumsum([0, *map(len, paths.nodes)]),
+        "nodes": [node for path_block in paths.nodes for node in path_block],
+        "position": paths.position,
+        "path_child": paths.path_child,
+        "parent": paths.tree.parent,
         "child_start": np.cumsum([0, *map(len, children)]),
         "children": [child for some in children for child in some],
     }

@@ -17,7 +17,7 @@ from ...kernels import articulated, composite, declare, kinematics, newton_euler
 from ...kernels.spatial import ARTICULATED, MOTION, POSE, RIGID
 from ...kernels.topology import Topology
 from ...runtime import launches, memory
-from ...runtime.call_order import Turn
+from ...runtime.call_order import CallOrder
 from ...runtime.memory import broadcast_worlds
 from ...scene.scene import Scene
 from ..parameters import Parameters
@@ -34,7 +34,7 @@ class Sweeps:
         topology: the tree's tables on the device.
         parameters: the scene's values on the device.
         functions: the functions that kernels at node granularity call at a node.
-        turn: of calls that use the workspace.
+        call_order: of calls that use the workspace.
         scan: does the work of some sweeps in few rounds; None where sweeps do it.
     """
 
@@ -49,14 +49,14 @@ class Sweeps:
         screw = np.column_stack([scene.dof_axis, scene.dof_angular, scene.dof_linear])
         self._screw: Any = wp.array(screw, dtype=dtype, device=device)
         self.parameters = Parameters(scene, self.topology, self.worlds, device, dtype, variable)
-        self.turn = Turn(device)
+        self.call_order = CallOrder(device)
         self._workspace: dict[Hashable, wp.array] = {}
         self._frames: dict[tuple, tuple[wp.array, wp.array]] = {}
         self._hinge_kernels: dict[bool, wp.Kernel | None] = {}  # with velocities or not
         self.scan: Scan | None = None
-        self.use_stretch(plan.stretch)
+        self.use_block_length(plan.block_length)
 
-    def use_stretch(self, length: int) -> None:
+    def use_block_length(self, length: int) -> None:
         """Let scans with so many nodes for a thread do the work of sweeps from now on; 0: let sweeps do it."""
         self.scan = Scan(self, length) if length else None
 

@@ -1,8 +1,8 @@
-"""States of bodies after a step, by walks along the tree: few texts for all links and bodies, geometry from a table.
+"""States of bodies after a step, by traversals of the tree: few texts for all links and bodies, geometry from a table.
 
-A walk goes from a root to the bodies of a piece. It holds the frame of one link, in inertial axes, moves it to the next
-link, and writes the states of its bodies. :func:`.kinematics.body_states` computes the same in statements of its own
-for each body; those of a humanoid, once a step, are fetched more slowly than they are executed.
+A traversal goes from a root to the bodies of a segment. It holds the frame of one link, in inertial axes, moves it to
+the next link, and writes the states of its bodies. :func:`.kinematics.body_states` computes the same in statements of
+its own for each body; those of a humanoid, once a step, are fetched more slowly than they are executed.
 """
 
 from __future__ import annotations
@@ -11,31 +11,32 @@ import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
-from ...hinges.quaternions import Quaternion, constant_quaternion, multiplied, turned
-from ...hinges.revolute import Turn
+from ...hinges.quaternions import Quaternion, constant_quaternion, multiply, turned
+from ...hinges.revolute import Revolute
 from ...recursions.kinematics import NEUTRAL, quaternions_in_links, relative_quaternion
 from ...recursions.model.links import Link, Links, place_link
-from ...recursions.model.scene_cache import remembered
-from ...recursions.model.segments import Pieces
+from ...recursions.model.scene_cache import cached_by_scene
+from ...recursions.model.segments import Segments
 from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Graph, Value, is_constant
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross
 
 GEOMETRY = "geometry"
-"""The table of RECORD numbers for each body: origin and quaternion in the frame that its link has in a walk, and its
-com; then of PLACE numbers for each link: origin and quaternion at rest in the frame that its parent has in a walk."""
+"""The table of RECORD numbers for each body: origin and quaternion in the frame that its link has in a traversal, and
+its com; then of PLACE numbers for each link: origin and quaternion at rest in the frame that its parent has in a
+traversal."""
 RECORD = 10
 PLACE = 7
 FRAME = "frame"
-"""The variables of a walk: origin, quaternion, omega, velocity."""
+"""The variables of a traversal: origin, quaternion, omega, velocity."""
 SIZE = 13
 BY_STATEMENTS = (
-    4  # dofs of unlike pieces up to which bodies have statements of their own, which are fetched fast enough
+    4  # dofs of unlike segments up to which bodies have statements of their own, which are fetched fast enough
 )
 
 
-class Frame(NamedTuple):
+class TraversalFrame(NamedTuple):
     """A frame in inertial axes: origin, quaternion, omega, velocity of the origin."""
 
     p: Vector
@@ -44,132 +45,141 @@ class Frame(NamedTuple):
     v: Vector
 
 
-def suits(links: Links) -> bool:
-    """Return whether bodies are walked to: all of them move, are rigid, and sit at places that do not vary.
+def is_supported(links: Links) -> bool:
+    """Return whether traversals serve a scene: all bodies move, are rigid, and sit at places that do not vary.
 
     Where statements of their own are few, they wait less, for nothing that is read from a table.
     """
-    if Pieces(links).unlike <= BY_STATEMENTS:
+    if Segments(links).distinct_dof_count <= BY_STATEMENTS:
         return False
     fixed = all(
         name not in links.variable and (links.scene.values[name] == links.scene.values[name][:1]).all()
         for name in ("joint_X_p", "joint_X_c")
     )
-    if not fixed or links.shared or links.flexible or any(seat.link is None for seat in links.seats.values()):
+    if (
+        not fixed
+        or links.shares_dofs
+        or links.flexible
+        or any(placement.link is None for placement in links.placements.values())
+    ):
         return False
     anchored = all(node.anchor == (IDENTITY, ZERO) for node in links.nodes.values())
     return anchored or all(is_constant(x) for node in links.nodes.values() for x in node.com)
 
 
-def walks(links: Links) -> list[list[tuple[bool, int]]]:
-    """Return the steps of a walk for each piece: (True, link) moves the frame, (False, body) stores a state."""
+def traversals(links: Links) -> list[list[tuple[bool, int]]]:
+    """Return the steps of a traversal for each segment: (True, link) moves the frame, (False, body) stores a state."""
     number = {id(link): at for at, link in enumerate(links.links)}
     bodies: dict[int, list[int]] = {}
-    for body in sorted(links.seats):
-        bodies.setdefault(id(links.seats[body].link), []).append(body)
+    for body in sorted(links.placements):
+        bodies.setdefault(id(links.placements[body].link), []).append(body)
     found = []
-    for piece in Pieces(links).pieces:
-        steps = [(True, number[id(link)]) for above in reversed(piece.ancestors) for link in above.links]
-        for link in piece.links:
+    for segment in Segments(links).all:
+        steps = [(True, number[id(link)]) for above in reversed(segment.ancestors) for link in above.links]
+        for link in segment.links:
             steps += [(True, number[id(link)]), *((False, body) for body in bodies.get(id(link), ()))]
         found.append(steps)
     return found
 
 
-@remembered
+@cached_by_scene
 def _numeric(scene: Scene) -> Links:
-    """Return the links of the first world; what is read of them holds in every world of a scene that :func:`suits`."""
+    """Return the links of the first world; what is read of them holds in every world of a scene that
+    :func:`is_supported`."""
     return Links(scene.with_values(**{name: array[:1] for name, array in scene.values.items()}))
 
 
-class Place(NamedTuple):
-    """Where a link is at rest in the frame that its parent has in a walk."""
+class RestPose(NamedTuple):
+    """Where a link is at rest in the frame that its parent has in a traversal."""
 
     matrix: Matrix | None
     offset: Vector
     rest: Quaternion
 
 
-@remembered
-def _places(scene: Scene) -> list[Place]:
+@cached_by_scene
+def _rest_poses(scene: Scene) -> list[RestPose]:
     """Return the places of all links, which are constants even if centres of mass vary."""
     links, found = _numeric(scene), []
     for link in links.links:
         matrix, offset, rest = link.matrix, link.offset, link.hinge.quaternion_at_rest(link)
         if link.parent is not None and _at_node(link.parent):
             offset, rest = _in_frame(links, link.parent, offset, rest)
-            node = links.seats[link.parent.node].matrix.T
+            node = links.placements[link.parent.node].matrix.T
             matrix = node if matrix is None else node @ matrix
-        found.append(Place(matrix, offset, rest))
+        found.append(RestPose(matrix, offset, rest))
     return found
 
 
-@remembered
+@cached_by_scene
 def geometry(scene: Scene) -> list[float]:
-    """Return the numbers of all bodies and of all links of a scene that :func:`suits`."""
+    """Return the numbers of all bodies and of all links of a scene that :func:`is_supported`."""
     links = _numeric(scene)
     within = quaternions_in_links(links)
     found: list[Value] = []
-    for body in sorted(links.seats):
-        seat, (R, p) = links.seats[body], links.nodes[body].anchor
-        assert seat.link is not None
-        offset, turn = _in_frame(links, seat.link, seat.offset - seat.matrix @ (R.T @ p), within[body])
+    for body in sorted(links.placements):
+        placement, (R, p) = links.placements[body], links.nodes[body].anchor
+        assert placement.link is not None
+        offset, turn = _in_frame(links, placement.link, placement.offset - placement.matrix @ (R.T @ p), within[body])
         found += [*offset, *turn, *scene.values["body_com"][0, body].tolist()]
-    for place in _places(scene):
+    for place in _rest_poses(scene):
         found += [*place.offset, *place.rest]
     return [float(x) for x in found]  # type: ignore[arg-type]
 
 
 def _at_node(link: Link) -> bool:
-    """Whether a walk has the frame of a link's node, because its own is at a centre of mass, which may vary."""
+    """Whether a traversal has the frame of a link's node, because its own is at a centre of mass, which may vary."""
     return link.hinge.at_com
 
 
 def _in_frame(links: Links, link: Link, offset: Vector, turn: Quaternion) -> tuple[Vector, Quaternion]:
-    """Return a place in the frame that a link has in a walk, for that in the frame of the link."""
+    """Return a place in the frame that a link has in a traversal, for that in the frame of the link."""
     if not _at_node(link):
         return offset, turn
-    node = links.seats[link.node]
+    node = links.placements[link.node]
     x, y, z, w = constant_quaternion(node.matrix)
-    return node.matrix.T @ (offset - node.offset), multiplied(Vector((-x, -y, -z, w)), turn)
+    return node.matrix.T @ (offset - node.offset), multiply(Vector((-x, -y, -z, w)), turn)
 
 
 def move_to_link(links: Links, number: int) -> list[Store]:
-    """Return the stores of a step of a walk to a link; equal for all links that turn about an axis on another one."""
-    link, over = links.links[number], Frame(ZERO, NEUTRAL, ZERO, ZERO)
-    if link.parent is not None and link.hinge.shape == Turn.name:
-        graph, first = Graph(), RECORD * len(links.seats) + PLACE * number
+    """Return the stores of a step of a traversal to a link; equal for all links that turn about an axis on another
+    one."""
+    link, over = links.links[number], TraversalFrame(ZERO, NEUTRAL, ZERO, ZERO)
+    if link.parent is not None and link.hinge.shape == Revolute.name:
+        graph, first = Graph(), RECORD * len(links.placements) + PLACE * number
         table = [graph.input(GEOMETRY, first + i) for i in range(PLACE)]
         still = dataclasses.replace(link, matrix=None, offset=Vector(table[:3]), rest=Vector(table[3:]))
     else:
-        graph, place = links.graph, _places(links.scene)[number]
+        graph, place = links.graph, _rest_poses(links.scene)[number]
         still = dataclasses.replace(link, matrix=place.matrix, offset=place.offset, rest=place.rest)
     graph.step = "links|F"
     if link.parent is not None:
         over = _read(graph)
     frame = _frame_of_child(over, still, lambda c: graph.input("q", c), lambda dof: graph.input("qd", dof))
     if _at_node(link):
-        seat = links.seats[link.node]
-        arm, Q = turned(frame.Q, seat.offset), multiplied(frame.Q, constant_quaternion(seat.matrix))
-        frame = Frame(frame.p + arm, Q, frame.w, frame.v + cross(frame.w, arm))
+        placement = links.placements[link.node]
+        arm, Q = turned(frame.Q, placement.offset), multiply(frame.Q, constant_quaternion(placement.matrix))
+        frame = TraversalFrame(frame.p + arm, Q, frame.w, frame.v + cross(frame.w, arm))
     return [Store(FRAME, (i,), x) for i, x in enumerate(x for part in frame for x in part)]
 
 
-def _read(graph: Graph) -> Frame:
-    """Return the frame of a walk."""
+def _read(graph: Graph) -> TraversalFrame:
+    """Return the frame of a traversal."""
     values = [graph.input(FRAME, i) for i in range(SIZE)]
-    return Frame(Vector(values[:3]), Vector(values[3:7]), Vector(values[7:10]), Vector(values[10:]))
+    return TraversalFrame(Vector(values[:3]), Vector(values[3:7]), Vector(values[7:10]), Vector(values[10:]))
 
 
-def _frame_of_child(over: Frame, link: Link, q: Callable[[int], Value], qd: Callable[[int], Value]) -> Frame:
+def _frame_of_child(
+    over: TraversalFrame, link: Link, q: Callable[[int], Value], qd: Callable[[int], Value]
+) -> TraversalFrame:
     """Return the frame of a link for that of its parent, at q and qd."""
     place = place_link(link, q)
-    arm, Q = turned(over.Q, place.pose.l), multiplied(over.Q, relative_quaternion(link, q))
+    arm, Q = turned(over.Q, place.pose.l), multiply(over.Q, relative_quaternion(link, q))
     w, v = over.w, over.v + cross(over.w, arm)
     columns = link.hinge.inertial_columns(link, place, _axes(over.Q), _axes(Q), ZERO)
     for dof, (turn, shift) in zip(link.dofs, columns, strict=True):
         w, v = w + turn * qd(dof), v + shift * qd(dof)
-    return Frame(over.p + arm, Q, w, v)
+    return TraversalFrame(over.p + arm, Q, w, v)
 
 
 def _axes(Q: Quaternion) -> Matrix:
@@ -190,7 +200,7 @@ def store_body(links: Links, body: int) -> list[Store]:
     p, Q, w, v = _read(graph)
     number = [graph.input(GEOMETRY, RECORD * body + i) for i in range(RECORD)]
     com = [graph.input(*x.args) if not is_constant(x) else number[7 + i] for i, x in enumerate(links.nodes[body].com)]
-    offset, turn = turned(Q, Vector(number[:3])), multiplied(Q, Vector(number[3:7]))
+    offset, turn = turned(Q, Vector(number[:3])), multiply(Q, Vector(number[3:7]))
     arm = offset + turned(turn, Vector(com))
     pose, twist = (*(p + offset), *turn), (*(v + cross(w, arm)), *w)
     return [

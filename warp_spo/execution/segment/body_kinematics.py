@@ -1,4 +1,4 @@
-"""Programs that walk along the tree: warps go from its roots to the bodies of each piece, in one loop over steps.
+"""Kinematics of bodies in one loop over steps along the tree: warps go from its roots to the bodies of each segment.
 
 Steps that differ in numbers alone share a text. So little code stays in the instruction cache, and needs few registers.
 """
@@ -11,16 +11,18 @@ from ..array_access import make_emitter
 from ..builder import Builder, Job, Program, flatten
 from ..plan import MOST_WARPS
 from . import body_frames
-from .shared_code import SharedText
+from .shared_code import SharedCode
 
 
 def build(builder: Builder, job: Job, links: Links) -> Program | None:
     """Return the program of a job that stores the states of bodies; None if there is no room for them."""
-    walks, dtype = _by_warps(body_frames.walks(links)), builder.dtype
-    stores = {step: _stores(links, job, *step) for step in sorted({step for walk in walks for step in walk})}
+    traversals, dtype = _assign_to_warps(body_frames.traversals(links)), builder.dtype
+    stores = {
+        step: _stores(links, job, *step) for step in sorted({step for traversal in traversals for step in traversal})
+    }
     everything = [item for some in stores.values() for item in some]
     whole = [item for item in everything if item.array == "out"]
-    layout = builder.layout(job, whole, everything, warps=len(walks))
+    layout = builder.layout(job, whole, everything, warps=len(traversals))
     if not layout.further_staged:
         return None
     emitters: list[Emitter] = []
@@ -28,10 +30,10 @@ def build(builder: Builder, job: Job, links: Links) -> Program | None:
     for step, some in stores.items():
         emitters.append(make_emitter(dtype, job.shapes, layout, True))
         listings[step] = emitters[-1].region(some)
-    shared = SharedText(dtype, near=True)
-    cuda = _cuda(shared, walks, listings)
+    shared = SharedCode(dtype, near=True)
+    cuda = _cuda(shared, traversals, listings)
     declared = f"{C_TYPE[dtype]} {body_frames.FRAME}_row[{body_frames.SIZE}];"
-    steps = [listings[step] for walk in walks for step in walk]
+    steps = [listings[step] for traversal in traversals for step in traversal]
     cpu = "\n".join([declared, *(f"{{\n{render(listing, dtype)}\n}}" for listing in steps)])
     lists = {"table": shared.table, "shifts": shared.shifts, body_frames.GEOMETRY: body_frames.geometry(links.scene)}
     tables = {name: values for name, values in lists.items() if values}
@@ -44,11 +46,11 @@ def build(builder: Builder, job: Job, links: Links) -> Program | None:
     return builder.finish(job.routine, layout, cuda, cpu, tables, sum(each.operations for each in emitters))
 
 
-def _by_warps(walks: list[list]) -> list[list]:
-    """Return the walks of each warp in a row; the longest come first, each to the warp that has least to do."""
-    found: list[list] = [[] for _ in walks[:MOST_WARPS]]
-    for walk in sorted(walks, key=len, reverse=True):
-        min(found, key=len).extend(walk)
+def _assign_to_warps(traversals: list[list]) -> list[list]:
+    """Return the traversals of each warp in a row; the longest come first, each to the warp that has least to do."""
+    found: list[list] = [[] for _ in traversals[:MOST_WARPS]]
+    for traversal in sorted(traversals, key=len, reverse=True):
+        min(found, key=len).extend(traversal)
     return found
 
 
@@ -62,8 +64,8 @@ def _stores(links: Links, job: Job, moves: bool, number: int) -> list[Store]:
     ]
 
 
-def _cuda(shared: SharedText, walks: list[list], listings: dict[tuple[bool, int], Listing]) -> str:
-    """Return the loop of a warp over the steps of its walk; a table says the text and the place of each."""
+def _cuda(shared: SharedCode, traversals: list[list], listings: dict[tuple[bool, int], Listing]) -> str:
+    """Return the loop of a warp over the steps of its traversal; a table says the text and the place of each."""
     kinds: dict[str, list[tuple[bool, int]]] = {}
     for step, listing in listings.items():
         kinds.setdefault(listing.text, []).append(step)
@@ -74,11 +76,11 @@ def _cuda(shared: SharedText, walks: list[list], listings: dict[tuple[bool, int]
         head, (text,) = shared.merge([[listings[step] for step in steps]], "", f"k{kind}_", "who")
         branches += [f"{'else ' if kind else ''}if (kind == {kind}) {{", head, text, "}"]
     first, begin = len(shared.shifts), [0]
-    for walk in walks:
-        begin.append(begin[-1] + len(walk))
+    for traversal in traversals:
+        begin.append(begin[-1] + len(traversal))
     shared.shifts += begin
     table = len(shared.shifts)
-    shared.shifts += [x for walk in walks for step in walk for x in known[step]]
+    shared.shifts += [x for traversal in traversals for step in traversal for x in known[step]]
     return "\n".join(
         [
             f"const int last = {shared.integer(f'{first + 1} + warp')};",

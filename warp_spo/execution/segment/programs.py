@@ -1,7 +1,7 @@
-"""Programs at segment granularity: a block computes 32 worlds, a warp one limb of each.
+"""Programs at segment granularity: a block computes 32 worlds, a warp one segment of each.
 
-Limbs of equal structure run one text, in which what differs is read from a table. Without room for what limbs tell each
-other, or with pairs of bodies that one node holds, one thread can run the work of all limbs (``alone``).
+Segments of equal structure run one text, in which what differs is read from a table. Without room for what segments
+tell each other, or with pairs of bodies that one node holds, one thread can run the work of all segments (``alone``).
 """
 
 from __future__ import annotations
@@ -18,183 +18,186 @@ from ...recursions.contact import pair_pieces
 from ...recursions.contact.couples import Team as Couplings
 from ...recursions.contact.points import own_points
 from ...recursions.contact.secant_laws import SECANT
-from ...recursions.model import messages
-from ...recursions.model import shared_constants as alike
+from ...recursions.model import messages, shared_constants
 from ...recursions.model.messages import INWARD, OUTWARD
-from ...recursions.model.segments import PARTS, Piece, Pieces
+from ...recursions.model.segments import PARTS, Segment, Segments
 from ...recursions.model.tracing import Trace
 from ...recursions.step.step import FORCE, GAIN, GUESS, MISSED, RESISTANCE
 from ...trace.emission import Emitter, Store, under
-from ...trace.register_spilling import set_aside
+from ...trace.register_spilling import spill_registers
 from ...trace.scalars import Scalar, Value, is_literal, negative, ordered
 from .. import staging
 from ..array_access import make_emitter
 from ..builder import Builder, Job, Program, flatten
 from ..device_facts import RESERVED
-from .warp_specialized import HELD, Passes, Team, Work
+from .warp_specialized import HELD, PassLoop, SegmentCode, WarpSpecializedKernel
 
 MOST_REGISTERS = 255  # of a thread
-BODIES = "bodies"  # option of a step by limbs whose kernel writes the states of bodies, too
+BODIES = "bodies"  # option of a step by segments whose kernel writes the states of bodies, too
 
 
-class Traced(NamedTuple):
-    """The stores of the work on one piece.
+class SegmentTrace(NamedTuple):
+    """The stores of the work on one segment.
 
     Attributes:
         stores: what its trace returns.
-        begin: what it stores and sends before the passes. held: what it computes once before them.
-        laws, checks, news, rounds, couples, carried: as of a :class:`~warp_spo.recursions.model.tracing.Trace`.
-        numbers: its constants, where they may be kept from folding.
+        prologue: what it stores and sends before the passes. held: what it computes once before them.
+        laws, checks, final_messages, final_stores, couples, kept_between_sweeps: as of a
+            :class:`~warp_spo.recursions.model.tracing.Trace`.
+        constants: its constants, where they may be kept from folding.
     """
 
     stores: list[Store]
-    begin: list[Store]
+    prologue: list[Store]
     held: list[Scalar]
     laws: list[list[Store]]
     checks: list[list[Store]]
-    news: list[Store]
-    rounds: list[list[Store]]
+    final_messages: list[Store]
+    final_stores: list[list[Store]]
     couples: list[tuple[int, list[Store]]]
-    carried: list[Value]
-    numbers: alike.Numbers | None
+    kept_between_sweeps: list[Value]
+    constants: shared_constants.SharedConstants | None
 
     @property
     def everything(self) -> list[Store]:
-        """All stores of a piece."""
-        turns = (*self.laws, *self.checks, *self.rounds, *(items for _, items in self.couples))
-        return [*self.begin, *self.stores, *self.news, *(item for turn in turns for item in turn)]
+        """All stores of a segment."""
+        turns = (*self.laws, *self.checks, *self.final_stores, *(items for _, items in self.couples))
+        return [*self.prologue, *self.stores, *self.final_messages, *(item for turn in turns for item in turn)]
 
 
-class Gathered(NamedTuple):
-    """The work of all pieces before it is one text.
+class SegmentsCode(NamedTuple):
+    """The work of all segments before it is one text.
 
     Attributes:
-        table: which value each entry of the result receives, if a table says so. sent: how many scalars pieces send.
-        looks_up: some piece reads heights. couples: the pairs of bodies. numbers: the constants of each piece.
+        table: which value each entry of the result receives, if a table says so. sent: how many scalars segments send.
+        looks_up: some segment reads heights. couples: the pairs of bodies. constants: those of each segment.
     """
 
-    team: Team
+    kernel: WarpSpecializedKernel
     layout: KernelLayout
     table: list[int] | None
     sent: int
     looks_up: bool
     couples: Couplings | None
-    numbers: list[alike.Numbers]
+    constants: list[shared_constants.SharedConstants]
 
 
-def build(builder: Builder, job: Job, pieces: Pieces, alone: bool = False, local: bool = False) -> Program | None:
-    """Return the program in which limbs share the work, None if there is no room.
+def build(builder: Builder, job: Job, segments: Segments, alone: bool = False, local: bool = False) -> Program | None:
+    """Return the program in which segments share the work, None if there is no room.
 
     Args:
         builder: the parts that all programs share.
         job: what the program computes.
-        pieces: the limbs.
+        segments: the segments.
         alone: one thread takes them all. local: it keeps what they tell each other in memory of its own.
     """
-    return _Limbs(builder, job, pieces, alone, local).build()
+    return _SegmentProgram(builder, job, segments, alone, local).build()
 
 
-class _Limbs:
-    """The work of limbs on a job; arguments as of :func:`build`."""
+class _SegmentProgram:
+    """The work of segments on a job; arguments as of :func:`build`."""
 
-    def __init__(self, builder: Builder, job: Job, pieces: Pieces, alone: bool, local: bool):
-        self.builder, self.job, self.pieces, self.alone, self.local = builder, job, pieces, alone, local
+    def __init__(self, builder: Builder, job: Job, segments: Segments, alone: bool, local: bool):
+        self.builder, self.job, self.segments, self.alone, self.local = builder, job, segments, alone, local
         self.run, self.plan, self.dtype = builder.run, builder.plan, builder.dtype
         self.letters = messages.needed(job.routine.letters, job.shapes)
-        self.slots, self.sent = messages.slots(self.letters, pieces)
+        self.offsets, self.sent = messages.offsets(self.letters, segments)
         self.couples = self._couples() if job.routine.couples else None
         self.sent = self.couples.layout["end"] if self.couples is not None else self.sent
-        self.unfolds = not job.routine.couples  # constants in which limbs differ may be kept from folding
+        self.unfolds = not job.routine.couples  # constants in which segments differ may be kept from folding
 
     def build(self) -> Program | None:
         """Return the program; of two, with constants that fold and with some that do not, that with fewer texts."""
-        found = self._gather([frozenset()] * len(self.pieces.pieces))
+        found = self._gather([frozenset()] * len(self.segments.all))
         if found is not None and self.unfolds:
-            apart = alike.differing(self.pieces.pieces, found.numbers, found.team.texts)
-            other = self._gather(apart) if any(apart) else None
-            if other is not None and len(set(other.team.texts)) < len(set(found.team.texts)):
+            unfolded = shared_constants.find_differing(self.segments.all, found.constants, found.kernel.texts)
+            other = self._gather(unfolded) if any(unfolded) else None
+            if other is not None and len(set(other.kernel.texts)) < len(set(found.kernel.texts)):
                 found = other
         return None if found is None else self._finish(found)
 
     def _couples(self) -> Couplings:
         """Return the pairs of bodies as a team couples them; their values follow those of messages."""
         links = self.builder.links
-        seats = pair_pieces.seats_of(links, pieces := Pieces(links))
-        alpha = -1 if seats is None or seats.base is None else self.slots["a", seats.base.index]
-        return pair_pieces.team(links, pieces, alpha, self.sent)
+        seats = pair_pieces.seats_of(links, segments := Segments(links))
+        alpha = -1 if seats is None or seats.base is None else self.offsets["a", seats.base.index]
+        return pair_pieces.team(links, segments, alpha, self.sent)
 
-    # -- the work of each piece ------------------------------------------------------------------------------------
-    def _trace(self, index: int, unfolded: frozenset) -> Traced:
-        """Return what the work on a piece stores; the constants ``unfolded`` do not fold, see :mod:`.alike`."""
+    # -- the work of each segment ------------------------------------------------------------------------------------
+    def _trace(self, index: int, unfolded: frozenset) -> SegmentTrace:
+        """Return what the work on a segment stores; the constants ``unfolded`` do not fold, see
+        :mod:`.shared_constants`."""
         shapes, options = self.job.shapes, self.job.options
-        links = self.builder.own_links(options, self.unfolds)  # its own: pieces of equal structure then give equal text
-        slot = lambda letter, piece: self.slots[letter, piece.index]  # noqa: E731
-        trace = Trace(links, self.dtype, tuple(shapes), Pieces(links).pieces[index], slot)
+        links = self.builder.own_links(
+            options, self.unfolds
+        )  # its own: segments of equal structure then give equal text
+        offset = lambda letter, segment: self.offsets[letter, segment.index]  # noqa: E731
+        trace = Trace(links, self.dtype, tuple(shapes), Segments(links).all[index], offset)
         trace.team = self.couples
-        if self.unfolds and trace.piece is not None:
+        if self.unfolds and trace.segment is not None:
             points = [number for number, _ in own_points(trace)]
-            links.numbers = alike.Numbers(links.graph, trace.piece, points, unfolded)
+            links.shared_constants = shared_constants.SharedConstants(links.graph, trace.segment, points, unfolded)
 
         def flat(items: list[Store]) -> list[Store]:
             return [flatten(item, shapes) for item in items]
 
         stores = flat(self.job.routine.trace(trace, **options))
-        found = Traced(
+        found = SegmentTrace(
             stores=stores,
-            begin=trace.begin,
-            held=trace.ahead,
-            laws=trace.laws,
-            checks=trace.checks,
-            news=flat(trace.news),
-            rounds=[flat(turn) for turn in trace.rounds],
+            prologue=trace.prologue,
+            held=trace.pass_invariants,
+            laws=trace.law_stores,
+            checks=trace.check_stores,
+            final_messages=flat(trace.final_messages),
+            final_stores=[flat(turn) for turn in trace.final_stores],
             couples=trace.couples,
-            carried=trace.carried,
-            numbers=links.numbers if self.unfolds else None,
+            kept_between_sweeps=trace.kept_between_sweeps,
+            constants=links.shared_constants if self.unfolds else None,
         )
-        return found._replace(held=_read(found.held, [*found.everything][len(found.begin) :]))
+        return found._replace(held=_read(found.held, [*found.everything][len(found.prologue) :]))
 
-    def _gather(self, unfolded: list[frozenset]) -> Gathered | None:
-        """Return the work of all pieces, None if there is no room; ``unfolded``: by piece, see :meth:`_trace`."""
-        job, pieces = self.job, self.pieces
+    def _gather(self, unfolded: list[frozenset]) -> SegmentsCode | None:
+        """Return the work of all segments, None if there is no room; ``unfolded``: by segment, see :meth:`_trace`."""
+        job, segments = self.job, self.segments
         routine = job.routine
-        traced = [self._trace(index, unfolded[index]) for index in range(len(pieces.pieces))]
+        traced = [self._trace(index, unfolded[index]) for index in range(len(segments.all))]
         everything = [item for one in traced for item in one.everything]
         bends = any(item.array == MISSED for item in everything)
         if not (bends or routine.counted):
             traced = [one._replace(held=[]) for one in traced]
         passes = self._passes(traced, bends)
-        sent = self.sent + (2 * pieces.warps if bends else 0)
+        sent = self.sent + (2 * segments.warps if bends else 0)
         whole = [item for item in everything if item.array == "out"]
-        warps = 1 if self.alone else pieces.warps
+        warps = 1 if self.alone else segments.warps
         layout = self.builder.layout(job, whole, everything, 0 if self.local else sent, warps)
         if not self._fits(layout):
             return None
         declared = "" if self.couples is None else coupling_teams.declare(self.couples, self.run.dtype, self.local)
-        team = Team(pieces, self.dtype, passes, declared)
+        kernel = WarpSpecializedKernel(segments, self.dtype, passes, declared)
         outs = [[item for item in one.stores if item.array == "out"] for one in traced]
         placed, table = staging.arrange_stores(whole, layout.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
         looks_up = False
-        for piece, one, items in zip(pieces.pieces, traced, outs, strict=True):
-            looks_up |= self._add_work(team, layout, table, piece, one, items)
-        numbers = [one.numbers for one in traced if one.numbers is not None]
-        return Gathered(team, layout, table, sent, looks_up, self.couples, numbers)
+        for segment, one, items in zip(segments.all, traced, outs, strict=True):
+            looks_up |= self._add_work(kernel, layout, table, segment, one, items)
+        constants = [one.constants for one in traced if one.constants is not None]
+        return SegmentsCode(kernel, layout, table, sent, looks_up, self.couples, constants)
 
-    def _passes(self, traced: list[Traced], bends: bool) -> Passes | None:
+    def _passes(self, traced: list[SegmentTrace], bends: bool) -> PassLoop | None:
         """Return how the work is repeated; ``bends``: guesses of a pass may turn out wrong."""
         sizes = {index: len(one.held) for index, one in enumerate(traced)}
         if self.job.routine.counted:
-            counts = [sum(item.array == SECANT for item in one.begin) for one in traced]
-            return Passes((GAIN,), None, sizes, dict(enumerate(counts)))
+            counts = [sum(item.array == SECANT for item in one.prologue) for one in traced]
+            return PassLoop((GAIN,), None, sizes, dict(enumerate(counts)))
         if not self.job.routine.passes:
             return None
         kept = (GUESS, GAIN, FORCE, RESISTANCE) if any(one.laws for one in traced) else (GUESS, GAIN)
-        return Passes(kept, self.sent if bends else None, sizes)
+        return PassLoop(kept, self.sent if bends else None, sizes)
 
     def _fits(self, layout: KernelLayout) -> bool:
-        """Whether shared memory has room for the result, for messages of limbs, and for the states of bodies.
+        """Whether shared memory has room for the result, for messages of segments, and for the states of bodies.
 
-        The result without room matters more than a thread a limb; another kernel then writes the states of bodies.
+        The result without room matters more than a thread a segment; another kernel then writes the states of bodies.
         """
         routine, options = self.job.routine, self.job.options
         if layout.result.way == DIRECT and layout.result.array.entries > staging.LONG_ROW:
@@ -204,9 +207,15 @@ class _Limbs:
         return not options.get(BODIES) or bool(layout.further_staged)
 
     def _add_work(
-        self, team: Team, layout: KernelLayout, table: list[int] | None, piece: Piece, one: Traced, outs: list[Store]
+        self,
+        kernel: WarpSpecializedKernel,
+        layout: KernelLayout,
+        table: list[int] | None,
+        segment: Segment,
+        one: SegmentTrace,
+        outs: list[Store],
     ) -> bool:
-        """Add the statements of a piece to the team, ``outs`` of its stores; return whether it reads heights."""
+        """Add the statements of a segment to the kernel, ``outs`` of its stores; return whether it reads heights."""
         routine, shapes, more, _ = self.job
 
         def emitter() -> Emitter:
@@ -216,56 +225,58 @@ class _Limbs:
             return found if table is None else staging.stores_by_slot(found, table)
 
         first, sweeps, ruling, checking = (emitter() for _ in range(4))
-        later = emitter() if team.passes else sweeps
-        ahead = first.region([*one.begin, *(Store(HELD, (at,), value) for at, value in enumerate(one.held))])
+        later = emitter() if kernel.passes else sweeps
+        pass_invariants = first.region(
+            [*one.prologue, *(Store(HELD, (at,), value) for at, value in enumerate(one.held))]
+        )
         sweeps.keep(HELD, one.held)
         if routine.counted:
-            later.keep(HELD, one.held)  # other pieces may have written over what these come from
+            later.keep(HELD, one.held)  # other segments may have written over what these come from
         inward = [item for item in one.stores if item.array == INWARD]
         outward = [item for item in one.stores if item.array == OUTWARD]
         last = outward if set(self.letters) & set(messages.OUTWARD_LETTERS) else inward
         last += by_slot(outs)
         last += [item for item in one.stores if item.array in (*more, GAIN, SECANT)]
-        sweep = sweeps.region(inward, one.carried)
+        sweep = sweeps.region(inward, one.kept_between_sweeps)
         couples = [under(sweeps.branch(items), "SENT({}) > 0", INWARD, flag) for flag, items in one.couples]
         back = sweeps.region(outward)
-        ends = [item for item in one.news if item.array == "out"]
-        news = later.branch([item for item in one.news if item.array != "out"] + by_slot(ends))
-        rounds = [later.branch(by_slot(turn)) for turn in one.rounds]
+        ends = [item for item in one.final_messages if item.array == "out"]
+        final_messages = later.branch([item for item in one.final_messages if item.array != "out"] + by_slot(ends))
+        final_stores = [later.branch(by_slot(turn)) for turn in one.final_stores]
         laws, checks = [ruling.branch(turn) for turn in one.laws], [checking.branch(turn) for turn in one.checks]
         emitters = {first, sweeps, later, ruling, checking}
-        work = Work(piece, sweep, back, laws, checks, news, rounds, ahead, couples)
-        team.add(work, sum(each.operations for each in emitters))
+        work = SegmentCode(segment, sweep, back, laws, checks, final_messages, final_stores, pass_invariants, couples)
+        kernel.add(work, sum(each.operations for each in emitters))
         return any(each.counts["lookup"] for each in emitters)
 
     # -- from the work to a kernel ---------------------------------------------------------------------------------
-    def _finish(self, found: Gathered) -> Program:
+    def _finish(self, found: SegmentsCode) -> Program:
         """Return the program of gathered work."""
-        team, layout, table, sent, looks_up, couples, _ = found
+        kernel, layout, table, sent, looks_up, couples, _ = found
         routine, T = self.job.routine, self.run.dtype
-        cpu = team.cpu()
+        cpu = kernel.cpu()
         if self.local:
             cpu = f"{C_TYPE[T]} sent[{sent}];\n#undef SENT\n#define SENT(i) sent[i]\n{cpu}"
-        cuda = cpu if self.alone else team.cuda()  # fills the tables
+        cuda = cpu if self.alone else kernel.cuda()  # fills the tables
         registers = self._registers(layout)
-        if places := self.plan.places_aside(
+        if places := self.plan.spill_slots(
             routine, layout.shared_bytes(T), wp.types.type_size_in_bytes(T), layout.warps
         ):
-            layout, registers = layout._replace(aside=places), routine.aside
-            cuda = set_aside(cuda, C_TYPE[T], places)
-        lists = {"place": table, "table": team.shared.table, "shifts": team.shared.shifts}
+            layout, registers = layout._replace(spill_slots=places), routine.registers_when_spilling
+            cuda = spill_registers(cuda, C_TYPE[T], places)
+        lists = {"place": table, "table": kernel.shared.table, "shifts": kernel.shared.shifts}
         tables = {name: values for name, values in lists.items() if values} | self.builder.height_tables(looks_up)
         if couples is not None:
             tables |= self.builder.touch_tables(couples.points)
         cap = registers if registers < MOST_REGISTERS else None
-        return self.builder.finish(routine, layout, cuda, cpu, tables, team.shared.operations, cap)
+        return self.builder.finish(routine, layout, cuda, cpu, tables, kernel.shared.operations, cap)
 
     def _registers(self, layout: KernelLayout) -> int:
         """Return how many registers a thread may take, so that a multiprocessor holds as many blocks as help."""
-        warps = 1 if self.alone else self.pieces.warps
-        if self.dtype == "float32" and not self.plan.few:
+        warps = 1 if self.alone else self.segments.warps
+        if self.dtype == "float32" and not self.plan.latency_bound:
             for blocks, enough in self.job.routine.occupancy:
-                fewer = self._shared_registers(blocks * self.pieces.warps)
+                fewer = self._shared_registers(blocks * self.segments.warps)
                 room = blocks * (layout.shared_bytes(self.run.dtype) + RESERVED) <= self.plan.device.shared_bytes
                 if fewer >= enough and room:
                     return fewer

@@ -1,4 +1,4 @@
-"""One text for pieces of equal structure: the warps read the numbers and entries in which they differ from tables."""
+"""One text for segments of equal structure: the warps read the numbers and entries in which they differ from tables."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ KEEP = 'asm("" : "+r"({}));'  # keeps the compiler from computing a number anew 
 CACHED = 8192  # largest number of operations of a world whose code fits into the instruction cache
 
 
-class SharedText:
+class SharedCode:
     """The texts that warps of a team share, and the tables in which these warps differ.
 
     Args:
@@ -20,8 +20,8 @@ class SharedText:
         near: integers are read from shared memory.
 
     Attributes:
-        table: the constants in which equal pieces differ, as the kernel's array holds them.
-        shifts: the distances of the entries that equal pieces read and write, as the kernel's array holds them.
+        table: the constants in which equal segments differ, as the kernel's array holds them.
+        shifts: the distances of the entries that equal segments read and write, as the kernel's array holds them.
         operations: the number of floating-point operations of one world.
     """
 
@@ -80,7 +80,7 @@ class SharedText:
         """Return one text for each region; a warp reads the numbers and entries in which it differs from the tables.
 
         Args:
-            regions: for each region, the listings of all pieces of equal structure.
+            regions: for each region, the listings of all segments of equal structure.
             prefix: the prefix of the names of values.
             tables: the prefix of the names of values that are read from the tables.
             who: C++ for the index of the warp's listing.
@@ -122,9 +122,9 @@ class SharedText:
         return f"near_shifts[{entry}]" if self.near else f"__ldg(shifts.data + {entry})"
 
     def _distances(self, columns: list[tuple], tables: str) -> list[str]:
-        """Return statements that find how far the entries of a warp's piece lie from those of the first.
+        """Return statements that find how far the entries of a warp's segment lie from those of the first.
 
-        Where pieces lie in equal steps this is a product; a table would be waited for.
+        Where segments lie in equal steps this is a product; a table would be waited for.
         """
         places = range(len(columns[0]))
         steps = [column[1] if column == tuple(column[1] * at for at in places) else None for column in columns]
@@ -142,7 +142,7 @@ class SharedText:
 
 
 class _Columns:
-    """Distinct tuples, one value for each piece of equal structure, in the order of their first use."""
+    """Distinct tuples, one value for each segment of equal structure, in the order of their first use."""
 
     def __init__(self) -> None:
         self.columns: list[tuple] = []

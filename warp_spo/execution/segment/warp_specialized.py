@@ -1,6 +1,7 @@
-"""Teams: the kernel text in which several warps share the pieces of a robot, one warp for each leaf piece.
+"""A warp-specialized kernel: the warps of a block run different code on the same 32 worlds, one warp for each leaf
+segment.
 
-Barriers separate the stages, because a piece reads what other pieces have sent.
+Barriers separate the stages, because a segment reads what other segments have sent.
 """
 
 from __future__ import annotations
@@ -10,46 +11,47 @@ from typing import NamedTuple
 
 from ...kernels import pass_loops
 from ...recursions.contact.secant_laws import SECANT
-from ...recursions.model.segments import Piece, Pieces
+from ...recursions.model.segments import Segment, Segments
 from ...trace.emission import C_TYPE, Listing, render
-from .shared_code import SharedText, any_of, choose
+from .shared_code import SharedCode, any_of, choose
 
 HELD = "held"
-"""Name of the values that a piece computes once before its passes."""
+"""Name of the values that a segment computes once before its passes."""
 BARRIER = 'asm volatile("bar.sync 0;" ::: "memory");'
 
 
-class Work(NamedTuple):
-    """The statements of one piece.
+class SegmentCode(NamedTuple):
+    """The statements of one segment.
 
     Attributes:
-        piece: the piece.
+        segment: the segment.
         inward: the inward sweep.
         outward: the outward sweep.
         laws: what comes before the inward sweep of a pass, in turns of which many may be alike.
         checks: whether the guesses of a pass were right; with laws in such turns, otherwise in one turn at most.
-        news: what the piece sends to the others after the outward sweep; in work with passes, after the last pass.
-        rounds: what the piece computes, message by message, from the news of the other pieces.
-        ahead: in work with passes, what the piece computes once before them and keeps. Where a fixed number of passes
-            is counted, pieces send each other messages inward ahead, too.
-        couples: what the piece leaves for each couple of bodies that touches, after the inward sweep.
+        final_messages: what the segment sends to the others after the outward sweep; in work with passes, after the
+            last pass.
+        final_stores: what the segment computes, message by message, from the final messages of the other segments.
+        pass_invariants: in work with passes, what the segment computes once before them and keeps. Where a fixed number
+            of passes is counted, segments send each other messages inward ahead, too.
+        couples: what the segment leaves for each couple of bodies that touches, after the inward sweep.
     """
 
-    piece: Piece
+    segment: Segment
     inward: Listing
     outward: Listing
     laws: Sequence[Listing]
     checks: Sequence[Listing]
-    news: Listing
-    rounds: list[Listing]
-    ahead: Listing = Listing("", [], [], [])
+    final_messages: Listing
+    final_stores: list[Listing]
+    pass_invariants: Listing = Listing("", [], [], [])
     couples: Sequence[Listing] = ()
 
     @property
     def text(self) -> tuple[str, ...]:
-        """The statements without their numbers and entries; equal for pieces of equal structure."""
+        """The statements without their numbers and entries; equal for segments of equal structure."""
         return (
-            self.ahead.text,
+            self.pass_invariants.text,
             self.inward.text,
             self.outward.text,
             *(each.text for each in self.checks),
@@ -57,16 +59,16 @@ class Work(NamedTuple):
         )
 
 
-class Passes(NamedTuple):
+class PassLoop(NamedTuple):
     """Work that a team repeats in passes, until the guesses of every warp were right.
 
     Attributes:
-        kept: the names of the values that a piece keeps from pass to pass, one for each of its dofs. They are arrays of
-            the thread with constant indices, which the compiler keeps in registers.
-        held: how many values each piece computes once before the passes, by its index; kept likewise.
+        kept: the names of the values that a segment keeps from pass to pass, one for each of its dofs. They are arrays
+            of the thread with constant indices, which the compiler keeps in registers.
+        held: how many values each segment computes once before the passes, by its index; kept likewise.
         flags: the place of the flags in the memory that the warps share; None if one pass suffices, because there is
             nothing to guess, or if passes are counted.
-        variables: how many more values each piece keeps from pass to pass, by its index, if passes are counted: their
+        variables: how many more values each segment keeps from pass to pass, by its index, if passes are counted: their
             number is an argument of the kernel. None: they go on until the guesses were right.
     """
 
@@ -80,23 +82,27 @@ class Passes(NamedTuple):
         """Whether the number of passes is an argument."""
         return self.variables is not None
 
-    def declare(self, pieces: dict[str, list[Piece]], c: str) -> str:
-        """Return declarations of what pieces keep; ``pieces`` gives, by prefix of the names, those that use them."""
+    def declare(self, segments: dict[str, list[Segment]], c: str) -> str:
+        """Return declarations of what segments keep; ``segments`` gives, by prefix of the names, those that use
+        them."""
         text = []
-        for prefix, some in pieces.items():
-            dofs, held = max(piece.weight for piece in some), max(self.held.get(piece.index, 0) for piece in some)
+        for prefix, some in segments.items():
+            dofs, held = (
+                max(segment.dof_count for segment in some),
+                max(self.held.get(segment.index, 0) for segment in some),
+            )
             text += [f"{c} {prefix}{name}_row[{dofs}] = {{}};" for name in self.kept]
             text += [f"{c} {prefix}{HELD}_row[{held}] = {{}};"] if held else []
-            more = max((self.variables or {}).get(piece.index, 0) for piece in some)
+            more = max((self.variables or {}).get(segment.index, 0) for segment in some)
             text += [f"{c} {prefix}{SECANT}_row[{more}] = {{}};"] if more else []
         return "\n".join(text)
 
 
-class Team:
-    """The work of all pieces of a scene, and the kernel text made of it.
+class WarpSpecializedKernel:
+    """The work of all segments of a scene, and the kernel text made of it.
 
     Args:
-        pieces: the pieces.
+        segments: the segments.
         dtype: the scalar type, "float32" or "float64".
         passes: the team repeats its work in passes; None if it does not.
         pairs: the definition of ``team_coupling``, which couples pairs of bodies; "" if there are none.
@@ -105,21 +111,21 @@ class Team:
         shared: the texts that its warps share, and their tables.
     """
 
-    def __init__(self, pieces: Pieces, dtype: str, passes: Passes | None = None, pairs: str = ""):
+    def __init__(self, segments: Segments, dtype: str, passes: PassLoop | None = None, pairs: str = ""):
         self.pairs = pairs
-        self.pieces, self.dtype, self.c, self.passes = pieces, dtype, C_TYPE[dtype], passes
-        self.shared = SharedText(dtype)
-        self._work: dict[int, Work] = {}
+        self.segments, self.dtype, self.c, self.passes = segments, dtype, C_TYPE[dtype], passes
+        self.shared = SharedCode(dtype)
+        self._work: dict[int, SegmentCode] = {}
 
-    def add(self, work: Work, operations: int) -> None:
-        """Add the work of a piece and its number of operations."""
-        self._work[work.piece.index] = work
+    def add(self, work: SegmentCode, operations: int) -> None:
+        """Add the work of a segment and its number of operations."""
+        self._work[work.segment.index] = work
         self.shared.operations += operations
 
     @property
     def texts(self) -> list[tuple[str, ...]]:
-        """The texts that are equal for pieces that share their code, by piece."""
-        return [self._work[piece.index].text for piece in self.pieces.pieces]
+        """The texts that are equal for segments that share their code, by segment."""
+        return [self._work[segment.index].text for segment in self.segments.all]
 
     @property
     def _definitions(self) -> list[str]:
@@ -130,95 +136,106 @@ class Team:
         """The last stage that has statements."""
         stages = [0]
         for work in self._work.values():
-            stages += [work.piece.inward] if work.inward.text else []
-            stages += [work.piece.outward] if work.outward.text else []
-            if work.rounds and not self.passes:
-                stages.append(self.pieces.stages - 1)  # inner pieces read the news in the last stage
+            stages += [work.segment.inward] if work.inward.text else []
+            stages += [work.segment.outward] if work.outward.text else []
+            if work.final_stores and not self.passes:
+                stages.append(self.segments.stages - 1)  # inner segments read the final messages in the last stage
         return max(stages)
 
     def cpu(self) -> str:
-        """Return the statements of all pieces in order, for one thread."""
+        """Return the statements of all segments in order, for one thread."""
         text: list[str] = []
         later: list[str] = []
         for stage in range(self._last + 1):
-            for piece in reversed(self.pieces.pieces):
-                if piece.inward == stage:
-                    text += [self._branch(piece, each) for each in self._work[piece.index].laws]
-                    text.append(render(self._work[piece.index].inward, self.dtype, f"p{piece.index}_"))
-                    responses = [self._branch(piece, each) for each in self._work[piece.index].couples]
+            for segment in reversed(self.segments.all):
+                if segment.inward == stage:
+                    text += [self._branch(segment, each) for each in self._work[segment.index].laws]
+                    text.append(render(self._work[segment.index].inward, self.dtype, f"p{segment.index}_"))
+                    responses = [self._branch(segment, each) for each in self._work[segment.index].couples]
                     text += ["if (coupled) {", *responses, "}"] if responses else []
             text += [couple_pairs("0", 1)] if self.pairs and stage == 0 else []
             text += [release_pairs("0", 1)] if self.pairs and stage == self._last else []
-            for piece in self.pieces.pieces:
-                if piece.outward == stage:
-                    text.append(render(self._work[piece.index].outward, self.dtype, f"p{piece.index}_"))
-                    text += [self._branch(piece, each) for each in self._work[piece.index].checks if each.text]
-                    (later if self.passes else text).append(self._branch(piece, self._work[piece.index].news))
+            for segment in self.segments.all:
+                if segment.outward == stage:
+                    text.append(render(self._work[segment.index].outward, self.dtype, f"p{segment.index}_"))
+                    text += [self._branch(segment, each) for each in self._work[segment.index].checks if each.text]
+                    (later if self.passes else text).append(
+                        self._branch(segment, self._work[segment.index].final_messages)
+                    )
         for work in self._work.values():
-            later += [self._branch(work.piece, listing) for listing in work.rounds]
+            later += [self._branch(work.segment, listing) for listing in work.final_stores]
         if self.passes:
-            kept = {f"p{piece.index}_": [piece] for piece in self.pieces.pieces}
+            kept = {f"p{segment.index}_": [segment] for segment in self.segments.all}
             order = reversed(self._work.values()) if self.passes.counted else self._work.values()  # children first
-            ahead = [self._branch(work.piece, work.ahead) for work in order if work.ahead.text]
+            pass_invariants = [
+                self._branch(work.segment, work.pass_invariants) for work in order if work.pass_invariants.text
+            ]
             if self.pairs:
-                ahead += [begin_pairs("0", 1)]
+                pass_invariants += [begin_pairs("0", 1)]
                 text = [push_pairs("LOAD", "0", 1), *text, judge_pairs("0", 1)]
             one, counted = "\n".join(text), self.passes.counted
             if counted:
                 loop = pass_loops.count_team_passes(one, "", self.c)
             else:
                 loop = pass_loops.repeat_thread_passes(one, self.c)
-            text = [*self._definitions, self.passes.declare(kept, self.c), *ahead, loop]
+            text = [*self._definitions, self.passes.declare(kept, self.c), *pass_invariants, loop]
         return "\n".join(text + later)
 
-    def _branch(self, piece: Piece, listing: Listing) -> str:
-        """Return the statements of a piece in braces."""
-        return "\n".join(["{", render(listing, self.dtype, f"p{piece.index}_"), "}"])
+    def _branch(self, segment: Segment, listing: Listing) -> str:
+        """Return the statements of a segment in braces."""
+        return "\n".join(["{", render(listing, self.dtype, f"p{segment.index}_"), "}"])
 
     def cuda(self) -> str:
-        """Return a branch for each structure of leaf pieces, which the warps of these pieces enter together."""
-        kinds: dict[tuple, list[Work]] = {}
+        """Return a branch for each structure of leaf segments, which the warps of these segments enter together."""
+        kinds: dict[tuple, list[SegmentCode]] = {}
         for work in self._work.values():
-            if not work.piece.children:
+            if not work.segment.children:
                 kinds.setdefault(work.text, []).append(work)
         text: list[str] = []
-        for alike in kinds.values():
-            text.append(f"{'else ' if text else ''}if ({any_of(_warps(alike))}) {{")
-            inward, outward = self._shared_sweeps(alike)
-            warps = [work.piece.warp for work in alike]
+        for equal in kinds.values():
+            text.append(f"{'else ' if text else ''}if ({any_of(_warps(equal))}) {{")
+            inward, outward = self._shared_sweeps(equal)
+            warps = [work.segment.warp for work in equal]
             between = self._inner(warps)
             if self.pairs:
-                inward = "\n".join([push_pairs("LOAD", "warp", self.pieces.warps), inward])
+                inward = "\n".join([push_pairs("LOAD", "warp", self.segments.warps), inward])
                 between = "\n".join([
-                    BARRIER, couple_pairs("warp", self.pieces.warps), between, release_pairs("warp", self.pieces.warps)
+                    BARRIER, couple_pairs("warp", self.segments.warps), between,
+                    release_pairs("warp", self.segments.warps)
                 ])  # fmt: skip
             text += [inward, between, outward]
-            if not self.passes and any(work.rounds for works in kinds.values() for work in works):
-                text += [self._take_turns(alike, [[work.news] for work in alike], "n_"), BARRIER, self._rounds(alike)]
+            if not self.passes and any(work.final_stores for works in kinds.values() for work in works):
+                text += [
+                    self._take_turns(equal, [[work.final_messages] for work in equal], "n_"),
+                    BARRIER,
+                    self._final_stores(equal),
+                ]
             text.append("}")
         return self._in_passes("\n".join(text)) if self.passes else "\n".join(text)
 
     def _in_passes(self, a_pass: str) -> str:
-        """Return ``a_pass`` in a loop, then the news of every piece, then the rounds."""
+        """Return ``a_pass`` in a loop, then the final messages of every segment, then the final stores."""
         assert self.passes is not None
-        leaves = [work for work in self._work.values() if not work.piece.children]
-        inner = [work for work in self._work.values() if work.piece.children]
-        ranks: list[dict[int, Work]] = [{leaf.piece.warp: leaf for leaf in leaves}]  # by warp, one of its pieces each
+        leaves = [work for work in self._work.values() if not work.segment.children]
+        inner = [work for work in self._work.values() if work.segment.children]
+        ranks: list[dict[int, SegmentCode]] = [
+            {leaf.segment.warp: leaf for leaf in leaves}
+        ]  # by warp, one of its segments each
         for work in inner:
-            warp = work.piece.warp
+            warp = work.segment.warp
             free = next((rank for rank in ranks if warp not in rank), None)
             if free is None:
                 ranks.append(free := {})
             free[warp] = work
         names = ["", *(f"i{at}_" for at in range(len(ranks) - 1))]
-        kept = {name: [work.piece for work in rank.values()] for name, rank in zip(names, ranks, strict=True)}
+        kept = {name: [work.segment for work in rank.values()] for name, rank in zip(names, ranks, strict=True)}
         text = [*self._definitions, self.passes.declare(kept, self.c)]
         ranks_by_name = dict(zip(names, ranks, strict=True))
-        text += self._ahead(leaves, ranks_by_name)
+        text += self._before_passes(leaves, ranks_by_name)
         if self.pairs:
-            text += [BARRIER, begin_pairs("warp", self.pieces.warps)]
-            a_pass = "\n".join([a_pass, BARRIER, judge_pairs("warp", self.pieces.warps)])
-        if self._in_turns:
+            text += [BARRIER, begin_pairs("warp", self.segments.warps)]
+            a_pass = "\n".join([a_pass, BARRIER, judge_pairs("warp", self.segments.warps)])
+        if self._laws_in_loops:
             a_pass = "\n".join(
                 [
                     self._turns_in_loops(leaves, ranks_by_name, "laws"),
@@ -231,12 +248,12 @@ class Team:
         elif self.passes.flags is None:
             text.append(pass_loops.run_one_pass(a_pass, BARRIER, self.c))
         else:
-            text.append(pass_loops.repeat_team_passes(a_pass, self.passes.flags, self.pieces.warps, self.c))
+            text.append(pass_loops.repeat_team_passes(a_pass, self.passes.flags, self.segments.warps, self.c))
         for last in (False, True):
             text_of_ranks = []
             for at, (name, rank) in enumerate(zip(names, ranks, strict=True)):
-                works = [rank.get(leaf.piece.warp) for leaf in leaves]
-                turns = [[] if work is None else work.rounds if last else [work.news] for work in works]
+                works = [rank.get(leaf.segment.warp) for leaf in leaves]
+                turns = [[] if work is None else work.final_stores if last else [work.final_messages] for work in works]
                 text_of_ranks.append(self._take_turns(leaves, turns, f"c{at}_", name))
             if last and any(text_of_ranks):
                 text.append(BARRIER)
@@ -244,90 +261,98 @@ class Team:
         return "\n".join(text)
 
     @property
-    def _in_turns(self) -> bool:
+    def _laws_in_loops(self) -> bool:
         """Whether laws are found, and passes checked, in turns."""
         return any(work.laws for work in self._work.values())
 
-    def _turns_in_loops(self, leaves: list[Work], ranks: dict[str, dict[int, Work]], name: str) -> str:
-        """Return the turns of pieces, the "laws" or the "checks", in loops; ``ranks`` as for :meth:`_ahead`."""
+    def _turns_in_loops(self, leaves: list[SegmentCode], ranks: dict[str, dict[int, SegmentCode]], name: str) -> str:
+        """Return the turns of segments, the "laws" or the "checks", in loops; ``ranks`` as for
+        :meth:`_before_passes`."""
         text = []
         for at, (prefix, rank) in enumerate(ranks.items()):
-            works = [rank.get(leaf.piece.warp) for leaf in leaves]
+            works = [rank.get(leaf.segment.warp) for leaf in leaves]
             turns = [[] if work is None else [*getattr(work, name)] for work in works]
             text.append(self._take_turns(leaves, turns, f"{name}{at}_", prefix, loops=True))
         return "\n".join(text)
 
-    def _ahead(self, leaves: list[Work], ranks: dict[str, dict[int, Work]]) -> list[str]:
-        """Return what pieces compute before the passes; counted passes begin with messages inward, stage by stage.
+    def _before_passes(self, leaves: list[SegmentCode], ranks: dict[str, dict[int, SegmentCode]]) -> list[str]:
+        """Return what segments compute before the passes; counted passes begin with messages inward, stage by stage.
 
-        ``ranks``: by prefix of the names, one piece of each warp.
+        ``ranks``: by prefix of the names, one segment of each warp.
         """
         assert self.passes is not None
         text: list[str] = []
         if not self.passes.counted:
             for at, (name, rank) in enumerate(ranks.items()):
-                works = [rank.get(leaf.piece.warp) for leaf in leaves]
-                text.append(self._take_turns(leaves, [[] if x is None else [x.ahead] for x in works], f"h{at}_", name))
+                works = [rank.get(leaf.segment.warp) for leaf in leaves]
+                text.append(
+                    self._take_turns(leaves, [[] if x is None else [x.pass_invariants] for x in works], f"h{at}_", name)
+                )
             return text
-        for stage in range(1 + max(work.piece.inward for work in self._work.values())):
+        for stage in range(1 + max(work.segment.inward for work in self._work.values())):
             text += [BARRIER] if stage else []
             for at, (name, rank) in reversed(list(enumerate(ranks.items()))):  # children before their parents
-                works = [rank.get(leaf.piece.warp) for leaf in leaves]
-                turns = [[x.ahead] if x is not None and x.piece.inward == stage else [] for x in works]
+                works = [rank.get(leaf.segment.warp) for leaf in leaves]
+                turns = [[x.pass_invariants] if x is not None and x.segment.inward == stage else [] for x in works]
                 text.append(self._take_turns(leaves, turns, f"h{stage}_{at}_", name))
         return text
 
     def _inner(self, warps: list[int]) -> str:
-        """Return the stages between the inward and outward sweeps of the leaves, for the inner pieces of ``warps``."""
-        owners: dict[tuple, list[list[Work]]] = {}
+        """Return the stages between the inward and outward sweeps of the leaves, for the inner segments of
+        ``warps``."""
+        owners: dict[tuple, list[list[SegmentCode]]] = {}
         for warp in warps:
-            mine = [work for work in self._work.values() if work.piece.children and work.piece.warp == warp]
+            mine = [work for work in self._work.values() if work.segment.children and work.segment.warp == warp]
             if mine:
-                owners.setdefault(tuple((w.text, w.piece.inward, w.piece.outward) for w in mine), []).append(mine)
+                owners.setdefault(tuple((w.text, w.segment.inward, w.segment.outward) for w in mine), []).append(mine)
         text: list[str] = []
         for chains in owners.values():
-            text.append(f"{'else ' if text else ''}if ({any_of([chain[0].piece.warp for chain in chains])}) {{")
-            shared = [self._shared_sweeps(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
+            text.append(f"{'else ' if text else ''}if ({any_of([chain[0].segment.warp for chain in chains])}) {{")
+            shared = [self._shared_sweeps(equal, f"i{at}_") for at, equal in enumerate(zip(*chains, strict=True))]
             for stage in range(1, self._last + 1):
                 text.append(BARRIER)
                 order = list(zip(chains[0], shared, strict=True))
-                text += [inward for work, (inward, _) in reversed(order) if work.piece.inward == stage]
-                for at, (alike, (_, outward)) in enumerate(zip(zip(*chains, strict=True), shared, strict=True)):
-                    if alike[0].piece.outward == stage:
+                text += [inward for work, (inward, _) in reversed(order) if work.segment.inward == stage]
+                for at, (equal, (_, outward)) in enumerate(zip(zip(*chains, strict=True), shared, strict=True)):
+                    if equal[0].segment.outward == stage:
                         text.append(outward)
                         if not self.passes:
                             text.append(
-                                self._take_turns(alike, [[work.news] for work in alike], f"i{at}_n_", f"i{at}_")
+                                self._take_turns(
+                                    equal, [[work.final_messages] for work in equal], f"i{at}_n_", f"i{at}_"
+                                )
                             )
             if not self.passes:
-                text += [self._rounds(alike, f"i{at}_") for at, alike in enumerate(zip(*chains, strict=True))]
+                text += [self._final_stores(equal, f"i{at}_") for at, equal in enumerate(zip(*chains, strict=True))]
             text.append("}")
         idle = [BARRIER] * self._last
         if text and len(warps) > sum(map(len, owners.values())):
             text += ["else {", *idle, "}"]
         return "\n".join(text or idle)
 
-    def _rounds(self, alike: Sequence[Work], prefix: str = "") -> str:
-        """Return the rounds of pieces of equal structure."""
-        return self._take_turns(alike, [work.rounds for work in alike], f"{prefix}x_", prefix)
+    def _final_stores(self, equal: Sequence[SegmentCode], prefix: str = "") -> str:
+        """Return the final stores of segments of equal structure."""
+        return self._take_turns(equal, [work.final_stores for work in equal], f"{prefix}x_", prefix)
 
     def _take_turns(
         self,
-        works: Sequence[Work],
+        works: Sequence[SegmentCode],
         turns: list[list[Listing]],
         tables: str,
         prefix: str = "",
         loops: bool | None = None,
     ) -> str:
-        """Return the statements that pieces execute in turns, see :meth:`.SharedText.take_turns`."""
+        """Return the statements that segments execute in turns, see :meth:`.SharedCode.take_turns`."""
         return self.shared.take_turns(_warps(works), turns, tables, prefix, loops)
 
-    def _shared_sweeps(self, alike: Sequence[Work], prefix: str = "") -> tuple[str, str]:
-        """Return one text for the inward and one for the outward sweeps of pieces of equal structure."""
-        checks = [] if self._in_turns else [list(each) for each in zip(*(work.checks for work in alike), strict=True)]
-        regions = [[work.inward for work in alike], [work.outward for work in alike], *checks]
-        regions += [list(each) for each in zip(*(work.couples for work in alike), strict=True)]
-        who = choose(_warps(alike), range(len(alike)))
+    def _shared_sweeps(self, equal: Sequence[SegmentCode], prefix: str = "") -> tuple[str, str]:
+        """Return one text for the inward and one for the outward sweeps of segments of equal structure."""
+        checks = (
+            [] if self._laws_in_loops else [list(each) for each in zip(*(work.checks for work in equal), strict=True)]
+        )
+        regions = [[work.inward for work in equal], [work.outward for work in equal], *checks]
+        regions += [list(each) for each in zip(*(work.couples for work in equal), strict=True)]
+        who = choose(_warps(equal), range(len(equal)))
         head, (inward, outward, *others) = self.shared.merge(regions, prefix, prefix, who)
         check, couples = "\n".join(others[: len(checks)]), others[len(checks) :]
         inward = "\n".join([inward, "if (coupled) {", *couples, "}"]) if any(couples) else inward
@@ -342,12 +367,13 @@ def begin_pairs(warp: str, warps: int) -> str:
 
 
 def push_pairs(which: str, warp: str, warps: int) -> str:
-    """Return code that leaves wrenches on the bodies of a warp's limb, from the "LOAD" or the "CHANGE" of couples."""
+    """Return code that leaves wrenches on the bodies of a warp's segment, from the "LOAD" or the "CHANGE" of
+    couples."""
     return f"team_coupling::push(sent, AT_{which}, coupled, {warp}, {warps});"
 
 
 def couple_pairs(warp: str, warps: int) -> str:
-    """Return code that couples the pairs when all limbs have come in."""
+    """Return code that couples the pairs when all segments have come in."""
     build = f"team_coupling::build(sent, dt_row[0], {warp}, {warps})"
     return f"if (coupled) {build};\nelse team_coupling::rest(sent, {warp});"
 
@@ -375,6 +401,6 @@ def _any_world(call: str, warps: int) -> str:
     return f"__syncthreads_or({call})" if warps > 1 else call
 
 
-def _warps(works: Sequence[Work]) -> list[int]:
-    """Return the warp of each piece."""
-    return [work.piece.warp for work in works]
+def _warps(works: Sequence[SegmentCode]) -> list[int]:
+    """Return the warp of each segment."""
+    return [work.segment.warp for work in works]

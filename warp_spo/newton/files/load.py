@@ -9,7 +9,7 @@ from xml.etree.ElementTree import ParseError
 
 import newton
 
-from ...scene.collision_shapes import POINTS, Choice
+from ...scene.collision_shapes import POINTS, ShapeSelection
 from ...scene.contacts import HeightField, Plane
 from ...scene.scene import Scene
 from .urdf import read_urdf
@@ -96,7 +96,7 @@ def load(
     """
     file = Path(path)
     importer = robot_format(file)
-    read: Callable[[Path, bool | None, bool, Choice], Scene]
+    read: Callable[[Path, bool | None, bool, ShapeSelection], Scene]
     if importer == "mjcf":
         from ...mujoco.mjcf import read_mjcf  # imports the package mujoco, which other formats do not need
 
@@ -104,7 +104,7 @@ def load(
     else:
         read = {"urdf": read_urdf, "usd": read_usd}[importer]
     try:
-        return read(file, floating, repair, Choice(contacts, ground, points))
+        return read(file, floating, repair, ShapeSelection(contacts, ground, points))
     except ParseError as error:
         raise ValueError(f"load: {str(file)!r} is not XML: {error}; expected {importer.upper()}") from None
     except ImportError as error:

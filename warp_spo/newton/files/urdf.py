@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 
 from ...errors import UnsupportedError
-from ...scene.collision_shapes import NONE, Choice
+from ...scene.collision_shapes import NONE, ShapeSelection
 from ...scene.parts import UNLIMITED, Body, Coupling, Hinge
 from ...scene.scene import Scene
 from ..worlds import quote_labels
 from .inertia_repair import repair_bodies
 from .urdf_masses import mass_of_shapes
 from .urdf_shapes import urdf_shapes
-from .xml_source import Element, read_xml
+from .xml_source import XmlElement, read_xml
 
 KINDS = {
     "fixed": "fixed",
@@ -42,7 +42,7 @@ TYPED = 5e-10  # an angle this close to a multiple of a quarter turn [rad] is on
 Inertial = tuple[float, np.ndarray, np.ndarray]  # mass [kg], centre of mass [m, 3], inertia about it [kg m^2, 3 x 3]
 
 
-def read_urdf(file: Path, floating: bool | None, repair: bool, choice: Choice = NONE) -> Scene:
+def read_urdf(file: Path, floating: bool | None, repair: bool, selection: ShapeSelection = NONE) -> Scene:
     """Return the scene of a URDF file. See :func:`warp_spo.newton.load`.
 
     Raises:
@@ -75,13 +75,13 @@ def read_urdf(file: Path, floating: bool | None, repair: bool, choice: Choice = 
         raise ValueError(f"load: {str(file)!r}: {error}") from error
     ordered = [links[link] for link in number]
     call = f"load: {str(file)!r}"
-    scene, lost = choice.applied(call, scene, lambda: urdf_shapes(robot, ordered, list(map(label, number)), _origin))
+    scene, lost = selection.apply(call, scene, lambda: urdf_shapes(robot, ordered, list(map(label, number)), _origin))
     if lost:
         warnings.warn(f"{call}: left out: {', '.join(lost)}", UserWarning, stacklevel=3)
     return scene
 
 
-def _check_robot(robot: Element) -> None:
+def _check_robot(robot: XmlElement) -> None:
     """Raise an error unless the root element is that of a URDF with links."""
     if robot.tag != "robot":
         raise robot.error("the outermost element; expected <robot>; if it is MJCF, let its name end in .xml")
@@ -96,9 +96,9 @@ def _check_robot(robot: Element) -> None:
         raise robot.error("no <link>; expected one or more; a file made by xacro is empty if its macro is never called")
 
 
-def _by_name(robot: Element, tag: str) -> dict[str, Element]:
+def _by_name(robot: XmlElement, tag: str) -> dict[str, XmlElement]:
     """Return the robot's links or joints by name."""
-    found: dict[str, Element] = {}
+    found: dict[str, XmlElement] = {}
     parts: list[Any] = robot.findall(tag)
     for element in parts:
         if found.setdefault(element.needed("name"), element) is not element:
@@ -107,7 +107,7 @@ def _by_name(robot: Element, tag: str) -> dict[str, Element]:
     return found
 
 
-def _ends(joint: Element) -> tuple[str, str]:
+def _ends(joint: XmlElement) -> tuple[str, str]:
     """Return the names of a joint's parent link and child link."""
     ends = [joint.child(tag) for tag in ("parent", "child")]
     for tag, end in zip(("parent", "child"), ends, strict=True):
@@ -116,10 +116,12 @@ def _ends(joint: Element) -> tuple[str, str]:
     return ends[0].needed("link"), ends[1].needed("link")  # type: ignore[union-attr]
 
 
-def _sort_joints(robot: Element, links: dict[str, Element], joints: dict[str, Element]) -> tuple[str, list[Element]]:
+def _sort_joints(
+    robot: XmlElement, links: dict[str, XmlElement], joints: dict[str, XmlElement]
+) -> tuple[str, list[XmlElement]]:
     """Return the root link and the joints depth first from it; raise ValueError unless all links form one tree."""
-    carriers: dict[str, Element] = {}
-    below: dict[str, list[Element]] = {link: [] for link in links}
+    carriers: dict[str, XmlElement] = {}
+    below: dict[str, list[XmlElement]] = {link: [] for link in links}
     for joint in joints.values():
         parent, child = _ends(joint)
         for link in (parent, child):
@@ -138,7 +140,7 @@ def _sort_joints(robot: Element, links: dict[str, Element], joints: dict[str, El
             f"links {quote_labels(roots)} are the child of no joint; expected one root link, so that all links form "
             "one tree; join them (type='fixed'), or load one file a robot"
         )
-    order: list[Element] = []
+    order: list[XmlElement] = []
     rest = [joint for root in roots for joint in reversed(below[root])]
     while rest:
         order.append(rest.pop())
@@ -150,7 +152,7 @@ def _sort_joints(robot: Element, links: dict[str, Element], joints: dict[str, El
 
 
 # -- joints ------------------------------------------------------------------------------------------------------------
-def _hinge(joint: Element, number: dict[str, int], label: Callable[[str], str]) -> Hinge:
+def _hinge(joint: XmlElement, number: dict[str, int], label: Callable[[str], str]) -> Hinge:
     """Return the hinge of a joint; ``number`` is the index of each link's body."""
     kind, (parent, child) = joint.needed("type"), _ends(joint)
     if kind not in KINDS:
@@ -174,7 +176,7 @@ def _hinge(joint: Element, number: dict[str, int], label: Callable[[str], str]) 
         raise joint.error(str(error)) from error
 
 
-def _origin(holder: Element) -> tuple[np.ndarray, np.ndarray]:
+def _origin(holder: XmlElement) -> tuple[np.ndarray, np.ndarray]:
     """Return the position [m, 3] and the unit quaternion (xyzw) that an element's <origin> gives."""
     origin = holder.child("origin")
     if origin is None:
@@ -202,7 +204,7 @@ def _rotation(quaternion: np.ndarray) -> np.ndarray:
     return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
 
 
-def _axis(joint: Element) -> np.ndarray:
+def _axis(joint: XmlElement) -> np.ndarray:
     """Return the unit vector along a joint's <axis>; x where there is none."""
     element = joint.child("axis")
     if element is None:
@@ -224,13 +226,13 @@ def _in_plane(normal: np.ndarray) -> list[np.ndarray]:
     return [first, np.cross(normal, first)]
 
 
-def _resistances(joint: Element) -> dict[str, float]:
+def _resistances(joint: XmlElement) -> dict[str, float]:
     """Return the damping [N m s/rad or N s/m] and the dry friction [N m or N] of a joint."""
     dynamics = joint.child("dynamics")
     return {} if dynamics is None else {name: dynamics.number(name, 0.0, least=0.0) for name in ("damping", "friction")}
 
 
-def _limits(joint: Element, kind: str) -> dict[str, float]:
+def _limits(joint: XmlElement, kind: str) -> dict[str, float]:
     """Return the limits of a joint, in the names of :class:`Hinge`.
 
     If one bound is absent it is zero, as URDF says. If both are absent, the joint has no limits, as in Newton.
@@ -253,7 +255,7 @@ def _limits(joint: Element, kind: str) -> dict[str, float]:
     return found
 
 
-def _couplings(joints: list[Element]) -> list[Coupling]:
+def _couplings(joints: list[XmlElement]) -> list[Coupling]:
     """Return the couplings of all mimics; hinge 0 is the base, hinge k + 1 that of joint k.
 
     A mimic of a mimic is followed to the joint that moves by itself. A mimic on a fixed joint says nothing. A mimic
@@ -266,7 +268,7 @@ def _couplings(joints: list[Element]) -> list[Coupling]:
         if mimic is None:
             continue
         ratio, offset, leader, seen = 1.0, 0.0, index, [index]
-        at: Element | None = mimic
+        at: XmlElement | None = mimic
         while at is not None:
             offset, ratio = offset + ratio * at.number("offset", 0.0), ratio * at.number("multiplier", 1.0)
             leader = by_name.get(at.needed("joint"), -1)
@@ -297,7 +299,7 @@ def _couplings(joints: list[Element]) -> list[Coupling]:
 
 
 # -- links -------------------------------------------------------------------------------------------------------------
-def _inertials(links: list[Element], hinges: list[Hinge], repair: bool) -> list[Inertial]:
+def _inertials(links: list[XmlElement], hinges: list[Hinge], repair: bool) -> list[Inertial]:
     """Return mass, centre of mass and inertia of each link, of which hinge k carries link k.
 
     Links that fixed joints join move as one. If no link of such a group has a mass, and with ``repair`` alone, the
@@ -331,7 +333,7 @@ def _inertials(links: list[Element], hinges: list[Hinge], repair: bool) -> list[
     return inertials
 
 
-def _inertial(link: Element) -> Inertial:
+def _inertial(link: XmlElement) -> Inertial:
     """Return the mass, the centre of mass and the inertia about it that a link's <inertial> gives; zeros without."""
     inertial = link.child("inertial")
     if inertial is None:

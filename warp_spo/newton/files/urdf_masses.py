@@ -10,10 +10,10 @@ from typing import Any
 import newton
 import numpy as np
 
-from .xml_source import Element
+from .xml_source import XmlElement
 
 
-def mass_of_shapes(link: Element) -> tuple[float, np.ndarray, np.ndarray]:
+def mass_of_shapes(link: XmlElement) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the mass [kg], the centre of mass [m, 3] and the inertia about it [kg m^2, 3 x 3] of a link's shapes.
 
     The density is Newton's, 1000 kg/m^3.
@@ -41,7 +41,7 @@ def mass_of_shapes(link: Element) -> tuple[float, np.ndarray, np.ndarray]:
     return float(builder.body_mass[0]), np.array(builder.body_com[0], dtype=np.float64), 0.5 * (inertia + inertia.T)
 
 
-def mesh_file(mesh: Element, why: str) -> Path:
+def mesh_file(mesh: XmlElement, why: str) -> Path:
     """Return the file of a <mesh>. A package is a folder of that name above the URDF, or beside one above it.
 
     ``why`` says in the error what the file is needed for, and a way out.
@@ -61,7 +61,7 @@ def mesh_file(mesh: Element, why: str) -> Path:
     raise mesh.error(f"there is no file {name!r}; expected a mesh, {why}")
 
 
-def unit_of(mesh: Element, file: Path) -> float:
+def unit_of(mesh: XmlElement, file: Path) -> float:
     """Return the length of the unit of a mesh's file [m]: that of a COLLADA file, 1 of others. No up axis is applied.
 
     Raises:

@@ -7,16 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from ...scene.collision_shapes import Shape
+from ...scene.collision_shapes import CollisionShape
 from .urdf_masses import mesh_file, unit_of
-from .xml_source import Element
+from .xml_source import XmlElement
 
 PRIMITIVES = ("sphere", "capsule", "cylinder", "box")
 
 
 def urdf_shapes(
-    robot: Element, links: list[Element], labels: list[str], origin: Callable[[Element], tuple[np.ndarray, np.ndarray]]
-) -> list[Shape]:
+    robot: XmlElement,
+    links: list[XmlElement],
+    labels: list[str],
+    origin: Callable[[XmlElement], tuple[np.ndarray, np.ndarray]],
+) -> list[CollisionShape]:
     """Return the <collision> elements of the links, of which link k is body k, in float64.
 
     Friction is that of Bullet's <contact><lateral_friction> in the link, or of <mu1> in a <gazebo> of the link.
@@ -40,9 +43,9 @@ def urdf_shapes(
             for shape in geometry:
                 if shape.tag in (*PRIMITIVES, "mesh"):
                     kind, sizes, names = _urdf_sizes(shape)
-                    found.append(Shape(name, body, kind, pose, sizes, friction=friction, names=names))
+                    found.append(CollisionShape(name, body, kind, pose, sizes, friction=friction, names=names))
                 else:
-                    found.append(Shape(name, body, f"<{shape.tag}>", pose))
+                    found.append(CollisionShape(name, body, f"<{shape.tag}>", pose))
     return found
 
 
@@ -78,7 +81,7 @@ def _vertices(shape: Any, file: Any) -> np.ndarray:
     return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
 
 
-def _urdf_friction(robot: Element, link: Any) -> float | None:
+def _urdf_friction(robot: XmlElement, link: Any) -> float | None:
     contact = link.child("contact")
     bullet = None if contact is None else contact.child("lateral_friction")
     if bullet is not None:

@@ -11,12 +11,12 @@ import newton
 import numpy as np
 
 from ...errors import UnsupportedError
-from ...scene.collision_shapes import NONE, Choice, Shape
+from ...scene.collision_shapes import NONE, CollisionShape, ShapeSelection
 from ...scene.contacts import Contact
 from ...scene.scene import Scene
 from ..model import from_newton
 from ..model_contacts import ModelShapes
-from ..worlds import Worlds, quote_labels
+from ..worlds import WorldRows, quote_labels
 from .inertia_repair import repair_bodies
 
 DIMENSIONS = {
@@ -36,7 +36,7 @@ DIMENSIONS = {
 """Powers of mass and length in the unit of each value, for a dof that slides and for one that turns."""
 
 
-def read_usd(file: Path, floating: bool | None, repair: bool, choice: Choice = NONE) -> Scene:
+def read_usd(file: Path, floating: bool | None, repair: bool, selection: ShapeSelection = NONE) -> Scene:
     """Return the scene of a USD file, in SI units.
 
     Raises:
@@ -77,7 +77,7 @@ def read_usd(file: Path, floating: bool | None, repair: bool, choice: Choice = N
             f"{str(file)!r} with bodies that are body1 of no joint ({quote_labels(loose)})",
             "join each to the world by a joint without body0, or put an articulation root above them all",
         )
-    return scene_of(file, builder, repair, choice)
+    return scene_of(file, builder, repair, selection)
 
 
 def _rigid_bodies(stage: Any) -> list[str]:
@@ -125,11 +125,11 @@ def _convert(builder: newton.ModelBuilder, metre: float, kilogram: float, gravit
             values.joint_mimic_coeffs[joint] = (own * offset, own / other * ratio)
 
 
-def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool, choice: Choice = NONE) -> Scene:
+def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool, selection: ShapeSelection = NONE) -> Scene:
     """Return the scene of a builder that read a file; errors name the file. Contacts obey Newton's groups and filters.
 
     Args:
-        file: for errors. builder: what an importer made of the file. choice: of shapes that touch the ground.
+        file: for errors. builder: what an importer made of the file. selection: of shapes that touch the ground.
         repair: replace masses and inertias that no rigid body can have; a warning names the bodies.
     """
     try:
@@ -148,12 +148,12 @@ def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool, choice: Cho
 
     @functools.cache
     def shapes() -> ModelShapes:
-        return ModelShapes(model, Worlds(model), materials=False)
+        return ModelShapes(model, WorldRows(model), materials=False)
 
-    def touches(shape: Shape, ground: Shape) -> bool:
+    def touches(shape: CollisionShape, ground: CollisionShape) -> bool:
         return shapes().touches(shape, ground)
 
-    scene, lost = choice.applied(call, scene, lambda: shapes().first(), touches, Shape.on)
+    scene, lost = selection.apply(call, scene, lambda: shapes().first(), touches, CollisionShape.with_mean_material)
     if lost:
         warnings.warn(f"{call}: left out: {', '.join(lost)}", UserWarning, stacklevel=4)
     return scene

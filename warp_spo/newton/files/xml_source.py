@@ -10,7 +10,7 @@ from xml.parsers import expat
 import numpy as np
 
 
-class Element(ET.Element):
+class XmlElement(ET.Element):
     """An XML element with its file and line. Its methods raise ValueError that names both.
 
     Attributes:
@@ -26,7 +26,7 @@ class Element(ET.Element):
         name = f" name={self.get('name')!r}" if self.get("name") else ""
         return ValueError(f"load: {str(self.file)!r}, line {self.line}, <{self.tag}{name}>: {what}")
 
-    def child(self, tag: str) -> Element | None:
+    def child(self, tag: str) -> XmlElement | None:
         """Return the only child of that tag, or None if there is none."""
         found: list[Any] = self.findall(tag)
         if len(found) > 1:
@@ -65,7 +65,7 @@ class Element(ET.Element):
         return values
 
 
-def read_xml(file: Path) -> Element:
+def read_xml(file: Path) -> XmlElement:
     """Return the root element of an XML file. Namespaces are not resolved: prefixes stay in the tags.
 
     Raises:
@@ -73,8 +73,8 @@ def read_xml(file: Path) -> Element:
     """
     parser = expat.ParserCreate()
 
-    def element(tag: str, attributes: dict[str, str]) -> Element:
-        made = Element(tag, attributes)
+    def element(tag: str, attributes: dict[str, str]) -> XmlElement:
+        made = XmlElement(tag, attributes)
         made.file, made.line = file, parser.CurrentLineNumber
         return made
 

@@ -24,7 +24,7 @@ from ..articulated import NO_INERTIA
 from ..articulated_sweeps import NO_FORCE, Factors, eliminate
 from ..model.links import Link
 from ..motion import STILL, carry_acceleration, hinge_entries, hinge_motion
-from .ties import Aggregate, Plan, key
+from .ties import Aggregate, TiePlan, key
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace
@@ -63,7 +63,7 @@ class Node:
         seats: where its links are, by id. ties: its couples.
     """
 
-    def __init__(self, trace: Trace, plan: Plan, aggregate: Aggregate, mask: Value, seats: Seats, ties: list[Tie]):
+    def __init__(self, trace: Trace, plan: TiePlan, aggregate: Aggregate, mask: Value, seats: Seats, ties: list[Tie]):
         self.trace, self.plan, self.aggregate, self.mask, self.seats = trace, plan, aggregate, mask, seats
         self.ties = ties
         self.dofs = [(id(link), i) for link in aggregate.links for i in range(len(link.dofs))]
@@ -121,8 +121,8 @@ class Node:
             return
         P, z = Articulated.unpacked([next(take) for _ in range(21)]), Vector(take)
         if not tops:
-            add(trace.dampers, id(base), P)
-            add(trace.pushes, id(base), -z)
+            add(trace.contact_inertia, id(base), P)
+            add(trace.contact_force, id(base), -z)
         for link in tops:
             first = link is tops[0]
             inner[id(link)], forces[id(link)] = (P, z) if first else (NO_INERTIA, NO_FORCE)
@@ -143,7 +143,7 @@ class Node:
             P = NO_INERTIA if link.inertia is None else link.inertia.articulated
             for child in link.children:
                 P = P if id(child) in mine else P + inner[id(child)]
-            P = P + trace.dampers[id(link)] if id(link) in trace.dampers else P
+            P = P + trace.contact_inertia[id(link)] if id(link) in trace.contact_inertia else P
             P, z = P + whole.get(id(link), NO_INERTIA), own[id(link)] + push.get(id(link), NO_FORCE)
             (pose, H), right = self._hinge(link), [tau(dof) for dof in link.dofs]
             if id(link) in self.plan.carried:
@@ -151,7 +151,7 @@ class Node:
                 f, n = (link.hinge.in_link_axes(place, right[part : part + 3]) for part in (0, 3))
                 z, right = force_to_parent(turn, z - Vector((*n, *f))), [0.0] * 6
                 P = turn.articulated_to_parent(P)
-            stiffened, over = trace.stiffened(link), self.plan.over[id(link)]
+            stiffened, over = trace.with_step_armature(link), self.plan.over[id(link)]
             whole[key(over)] = whole.get(key(over), NO_INERTIA) + pose.articulated_to_parent(P)
             push[key(over)] = push.get(key(over), NO_FORCE) + force_to_parent(pose, z)
             for i, column in enumerate(H):
@@ -161,7 +161,7 @@ class Node:
                 D[at, at] = D[at, at] + stiffened.armature[i]
                 eps[at] = right[i] - dot(column, z)
                 U[at] = self._carry(link, force, at, D, number)
-            for (i, j), x in link.coupled.items():
+            for (i, j), x in link.coupling_inertia.items():
                 first, last = sorted((number[id(link), i], number[id(link), j]))
                 D[last, first] = D[last, first] + x
         for tie in self.ties:
@@ -261,7 +261,7 @@ def force_to_parent(pose: Pose, z: Vector) -> Vector:
     return Vector((*n, *f))
 
 
-def reduce(trace: Trace, plan: Plan, nodes: dict[int, Node], tau: Callable[[int], Value]) -> tuple[Factors, dict]:
+def reduce(trace: Trace, plan: TiePlan, nodes: dict[int, Node], tau: Callable[[int], Value]) -> tuple[Factors, dict]:
     """Sweep inward; ``nodes`` by id of the first link of each aggregate. Return factors and D^-1 eps, by link."""
     done: Factors = {}
     rates: dict[int, list[Value]] = {}
@@ -270,13 +270,13 @@ def reduce(trace: Trace, plan: Plan, nodes: dict[int, Node], tau: Callable[[int]
     own: dict[int, Vector] = {}
     for link in trace.links.links:
         trace.place(link)
-        trace.ahead += trace.places[id(link)].pose.turn or ()
+        trace.pass_invariants += trace.places[id(link)].pose.turn or ()
     for link in reversed(plan.order):
         at, place = id(link), trace.places[id(link)]
         eliminate(trace, link, done, inner)
         trace.label(link, "z")
         mine = {id(one) for one in plan.of[at].links} if at in plan.of else set()
-        z = -trace.pushes[at] if at in trace.pushes else NO_FORCE
+        z = -trace.contact_force[at] if at in trace.contact_force else NO_FORCE
         own[at] = z
         for child in link.children:
             own[at] = own[at] if id(child) in mine else own[at] + forces[id(child)]
@@ -289,7 +289,7 @@ def reduce(trace: Trace, plan: Plan, nodes: dict[int, Node], tau: Callable[[int]
     return done, rates
 
 
-def expand(trace: Trace, plan: Plan, nodes: dict[int, Node], done: Factors, rates: dict, alpha: dict) -> list[Store]:
+def expand(trace: Trace, plan: TiePlan, nodes: dict[int, Node], done: Factors, rates: dict, alpha: dict) -> list[Store]:
     """Sweep outward; ``alpha`` receives the accelerations of links. Return the stores of qdd."""
     stores: list[Store] = []
     found: dict[int, tuple[list[Value], tuple[Vector, Vector]]] = {}
@@ -315,7 +315,9 @@ def expand(trace: Trace, plan: Plan, nodes: dict[int, Node], done: Factors, rate
     return stores
 
 
-def seats_of(trace: Trace, plan: Plan, aggregate: Aggregate, frames: dict[int | None, tuple[Matrix, Vector]]) -> Seats:
+def seats_of(
+    trace: Trace, plan: TiePlan, aggregate: Aggregate, frames: dict[int | None, tuple[Matrix, Vector]]
+) -> Seats:
     """Return where the links of an aggregate are, for inertial axes and origins of bodies that fly and of links."""
     R, o = frames[key(aggregate.base)] if key(aggregate.base) in frames else (IDENTITY, ZERO)
     found: dict[int | None, Seat] = {key(aggregate.base): Seat(IDENTITY, ZERO)}

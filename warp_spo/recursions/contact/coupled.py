@@ -18,9 +18,9 @@ from ..model.links import Link, Links
 from . import aggregates
 from .aggregates import LAST, Node, Seat, Seats, Tie, add
 from .pairs import RESIDUAL, place_axes_of, values_of, velocities_of
-from .points import Point, with_ancestors
-from .step import ContactStep, Touch
-from .ties import Couple, Plan, couples_of, flies, key
+from .points import TracedContactPoint, with_ancestors
+from .step import ContactStepTrace, PointState
+from .ties import Couple, TiePlan, couples_of, flies, key
 
 if TYPE_CHECKING:
     pass
@@ -39,22 +39,22 @@ MOST_WORK = 15_000  # products of an elimination, whose code has no loops; 8 pai
 
 def suits(links: Links) -> bool:
     """Whether aggregates couple the pairs of a scene: links share no dofs, all pairs move, code is not too long."""
-    pairs = ((links.seats[body].link if body >= 0 else None for body in (p.body, p.other))
+    pairs = ((links.placements[body].link if body >= 0 else None for body in (p.body, p.other))
              for p in links.scene.contact_pairs)  # fmt: skip
-    if any(link.group is not None for link in links.links) or not all(map(any, pairs)):
+    if any(link.shared_dofs is not None for link in links.links) or not all(map(any, pairs)):
         return False
-    return Plan(links, couples_of(links)).work <= MOST_WORK
+    return TiePlan(links, couples_of(links)).work <= MOST_WORK
 
 
-class CoupledStep(ContactStep):
+class CoupledStep(ContactStepTrace):
     """One time step with contacts of bodies with each other, too, as a trace; arguments as those of ContactStep."""
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
-        """Return the stores of a pass, then those after the last one; ``trace.begin`` are those before the first."""
+        """Return the stores of a pass, then those after the last one; ``trace.prologue`` are those before the first."""
         self.first: list[Store] = []
         self.twists: list[Store] = []
         found = super().stores(qdd, status)
-        self.trace.begin = [*self.trace.begin, *self.first]
+        self.trace.prologue = [*self.trace.prologue, *self.first]
         return found + self.twists + [item for name in self.reports for item in self._report_stores(name)]
 
     def inward(self, tau: Callable[[int], Value]) -> tuple[Factors, dict, list[Store]]:
@@ -65,10 +65,10 @@ class CoupledStep(ContactStep):
         """Return the stores of qdd; ``alpha`` receives the accelerations of links by id."""
         return aggregates.expand(self.trace, self.plan, self.nodes, done, rates, alpha)
 
-    def _press(self, points: list[Point], touches: list[Touch]) -> None:
-        super()._press(points, touches)
+    def _press(self, points: list[TracedContactPoint], states: list[PointState]) -> None:
+        super()._press(points, states)
         trace = self.trace
-        self.plan = Plan(trace.links, couples_of(trace.links), lambda link: flies(self._with_resistance(link)))
+        self.plan = TiePlan(trace.links, couples_of(trace.links), lambda link: flies(self._with_resistance(link)))
         self.couples = self.plan.couples
         passes = trace.graph.input("passes", 0)  # native code counts them, too
         self.first += [Store(VALUE, (i,), value) for i, value in enumerate([*values_of(self), passes])]
@@ -95,18 +95,18 @@ class CoupledStep(ContactStep):
             if couple.ties:
                 ties[number] = Tie(K, load, self._columns(number, couple))
             elif couple.g is None:
-                add(trace.dampers, id(couple.f), K)
-                add(trace.pushes, id(couple.f), load)
+                add(trace.contact_inertia, id(couple.f), K)
+                add(trace.contact_force, id(couple.f), load)
         self.nodes: dict[int, Node] = {}
         for aggregate in self.plan.aggregates:
             mask = total(trace.graph.input(COUPLED, number) for number in aggregate.couples)
             mine = [ties[number] for number in aggregate.couples]
             first, seats = aggregate.links[0], self.seats[aggregate.couples[0]]
             self.nodes[id(first)] = Node(trace, self.plan, aggregate, mask, seats, mine)
-            trace.ahead += [x for tie in mine for column in tie.J.values() for x in column]
+            trace.pass_invariants += [x for tie in mine for column in tie.J.values() for x in column]
             for seat in seats.values():
-                trace.ahead += [*(x for row in seat.turn for x in row), *seat.at]
-        trace.ahead += [x for R, _ in self.frames.values() for row in R for x in row]
+                trace.pass_invariants += [*(x for row in seat.turn for x in row), *seat.at]
+        trace.pass_invariants += [x for R, _ in self.frames.values() for row in R for x in row]
 
     def _frames(self, links: list[Link | None]) -> dict[int | None, tuple[Matrix, Vector]]:
         """Return axes and origins of links in the inertial frame."""
@@ -170,7 +170,7 @@ class CoupledStep(ContactStep):
         for pair in couple.pairs:
             row = links.scene.contact_pairs[pair]
             for side, (body, shape) in enumerate(zip((row.body, row.other), row.shapes, strict=True)):
-                own = links.seat(body, shape.pose)
+                own = links.placement(body, shape.pose)
                 seat = self._seat(number, couple, own.link)
                 at, turn = seat.at + seat.turn @ own.offset, seat.turn @ own.matrix
                 values = [*at, *(x for axis in turn for x in axis)]

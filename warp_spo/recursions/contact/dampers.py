@@ -10,12 +10,12 @@ from collections.abc import Sequence
 
 from ...trace.scalars import Value, branch, is_constant, reciprocal
 from ...trace.spatial import Articulated, Matrix, Rigid, Vector, cross, dot, skew, total, upper
-from .points import Point
+from .points import TracedContactPoint
 
 SEVERAL = 3  # points of one normal from which sums take fewer operations
 
 
-def damper(points: Sequence[Point], across: Sequence[Value], along: Sequence[Value]) -> Articulated:
+def damper(points: Sequence[TracedContactPoint], across: Sequence[Value], along: Sequence[Value]) -> Articulated:
     """Return the sum of the dampers ``across`` I + (``along`` - ``across``) n n* at points of one link."""
     found = None
     masses: dict[int, tuple[Vector, Value]] = {}
@@ -36,7 +36,7 @@ def _mass(r: Vector, weight: Value) -> Rigid:
     return Rigid(weight, r * weight, upper(lambda i, j: ((square if i == j else 0.0) - r[i] * r[j]) * weight))
 
 
-def _along(weighted: list[tuple[Point, Value]]) -> Articulated:
+def _along(weighted: list[tuple[TracedContactPoint, Value]]) -> Articulated:
     """Return the sum of dampers of these weights along one normal."""
     n, whole = weighted[0][0].normal, total(weight for _, weight in weighted)
     if len(weighted) < SEVERAL:
@@ -52,7 +52,7 @@ def _along(weighted: list[tuple[Point, Value]]) -> Articulated:
     return Articulated(J, Matrix.of([c * x for x in n] for c in lever), upper(lambda i, j: whole * (n[i] * n[j])))
 
 
-def load(points: Sequence[Point], pushes: Sequence[Value], P: Articulated, h: Value) -> Vector:
+def load(points: Sequence[TracedContactPoint], pushes: Sequence[Value], P: Articulated, h: Value) -> Vector:
     """Return the sum of f0 - G v before the step of points of one link, as (n; f) on it.
 
     Args:
@@ -74,15 +74,17 @@ def chosen(
     return Articulated.unpacked(found[:-6]), Vector(found[-6:])
 
 
-def _by_normal(points: Sequence[Point], values: Sequence[Value]) -> list[list[tuple[Point, Value]]]:
+def _by_normal(
+    points: Sequence[TracedContactPoint], values: Sequence[Value]
+) -> list[list[tuple[TracedContactPoint, Value]]]:
     """Return the points and their values, together those of one normal."""
-    found: dict[tuple, list[tuple[Point, Value]]] = {}
+    found: dict[tuple, list[tuple[TracedContactPoint, Value]]] = {}
     for point, value in zip(points, values, strict=True):
         key = tuple(x if is_constant(x) else x.key for x in point.normal)
         found.setdefault(key, []).append((point, value))
     return list(found.values())
 
 
-def _moment(weighted: list[tuple[Point, Value]]) -> Vector:
+def _moment(weighted: list[tuple[TracedContactPoint, Value]]) -> Vector:
     """Return the sum of arms times their weights."""
     return Vector(total(point.arm[i] * weight for point, weight in weighted) for i in range(3))

@@ -48,7 +48,7 @@ def lowest(ground: Plane | HeightField | Listed) -> int:
     return 0 if isinstance(ground, Plane) else 2
 
 
-class Place(NamedTuple):
+class GroundOffset(NamedTuple):
     """A world's ground among the values of the scene.
 
     Attributes:
@@ -62,7 +62,12 @@ class Place(NamedTuple):
 
 
 def surfaces(
-    graph: Graph, ground: Plane | HeightField, at: list[Value], place: Place, moves: list[Value], walls: bool = True
+    graph: Graph,
+    ground: Plane | HeightField,
+    at: list[Value],
+    place: GroundOffset,
+    moves: list[Value],
+    walls: bool = True,
 ) -> list[Surface]:
     """Return the surfaces near a point, whose place along each direction is ``at``; the step takes it by ``moves``.
 
@@ -111,7 +116,9 @@ class Corners(NamedTuple):
     first: Value
 
     @classmethod
-    def of(cls, graph: Graph, ground: HeightField, place: Place, i: Value, j: Value, together: bool = True) -> Corners:
+    def of(
+        cls, graph: Graph, ground: HeightField, place: GroundOffset, i: Value, j: Value, together: bool = True
+    ) -> Corners:
         """Return the corners of the cell (i, j) of a world's field, from the table of cells or, one by one, of heights.
 
         One by one is faster where neighbouring threads need neighbouring cells, and each height several times.
@@ -187,7 +194,9 @@ def by_cell(heights: np.ndarray) -> np.ndarray:
     return np.stack([heights, beside[0], far, beside[1]], axis=-1)
 
 
-def height(graph: Graph, ground: Plane | HeightField, x: Value, y: Value, place: Place, together: bool = True) -> Value:
+def height(
+    graph: Graph, ground: Plane | HeightField, x: Value, y: Value, place: GroundOffset, together: bool = True
+) -> Value:
     """Return the height of the ground at a point of the horizontal plane [m]; the plane must not be vertical.
 
     ``together``: as :meth:`Corners.of`.

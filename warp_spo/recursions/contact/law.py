@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 from ...trace.scalars import Value, inverse_root, less, select, sqrt
 from ...trace.spatial import ZERO, Vector, dot, total
-from .points import Point
+from .points import TracedContactPoint
 
 TINY = 1e-24  # square of a slip [m^2/s^2] that is nothing; its derivative is still a number in float32
 
 
-class Touch(NamedTuple):
+class PointState(NamedTuple):
     """Variables of a contact point between passes: friction's damper; 1 where it is closed, where it is a candidate."""
 
     across: Value
@@ -23,7 +23,7 @@ class Touch(NamedTuple):
     candidate: Value
 
 
-class Found(NamedTuple):
+class PointResult(NamedTuple):
     """Results of a pass for a point.
 
     Attributes:
@@ -38,14 +38,14 @@ class Found(NamedTuple):
     over: Value
     pulls: Value
     lacking: Value
-    left: Touch
+    left: PointState
 
     @property
     def excess(self) -> tuple[Value, Value, Value]:
         return self.over, self.pulls, self.lacking
 
 
-def begin_point(point: Point, gravity: Vector, h: Value) -> tuple[Value, Value]:
+def begin_point(point: TracedContactPoint, gravity: Vector, h: Value) -> tuple[Value, Value]:
     """Return friction's damper before the first pass, and whether the step may reach the ground."""
     normal = dot(point.normal, point.velocity)
     squares = total(x * x for x in gravity)
@@ -54,34 +54,36 @@ def begin_point(point: Point, gravity: Vector, h: Value) -> tuple[Value, Value]:
     candidate = less(0.0, point.depth + falls + reach)
     push = normal_force(point, normal, h)
     fn = candidate * select(less(0.0, push), push, 0.0)
-    return secant(point, fn, slip_speed(point, point.velocity, normal)), candidate
+    return friction_damper(point, fn, slip_speed(point, point.velocity, normal)), candidate
 
 
-def slip_speed(point: Point, x: Vector, normal: Value) -> Value:
+def slip_speed(point: TracedContactPoint, x: Vector, normal: Value) -> Value:
     """Return the size of a vector's part across the normal."""
     rest = x - point.normal * normal
     square = dot(rest, rest)
     return square * inverse_root(square + TINY)
 
 
-def secant(point: Point, fn: Value, w: Value) -> Value:
+def friction_damper(point: TracedContactPoint, fn: Value, w: Value) -> Value:
     """Return the damper that gives friction's bound at the speed ``w``."""
     return point.mu * fn * inverse_root(w * w + point.eps * point.eps)
 
 
-def normal_force(point: Point, speed: Value, h: Value) -> Value:
+def normal_force(point: TracedContactPoint, speed: Value, h: Value) -> Value:
     """Return the normal force of a closed point that leaves the ground at ``speed`` after the step."""
     return point.push - (point.k * h + point.d) * speed
 
 
-def force_at(point: Point, touch: Touch, v: Vector, h: Value) -> Vector:
+def force_at(point: TracedContactPoint, state: PointState, v: Vector, h: Value) -> Vector:
     """Return f0 - G v."""
     normal = dot(point.normal, v)
-    push = touch.closed * normal_force(point, normal, h)
-    return point.normal * (push + touch.across * normal) - v * touch.across
+    push = state.closed * normal_force(point, normal, h)
+    return point.normal * (push + state.across * normal) - v * state.across
 
 
-def finish_point(point: Point, touch: Touch, moved: tuple[Vector, Vector] | None, h: Value, closing: Value) -> Found:
+def finish_point(
+    point: TracedContactPoint, state: PointState, moved: tuple[Vector, Vector] | None, h: Value, closing: Value
+) -> PointResult:
     """Return what a pass finds of a point.
 
     Args:
@@ -92,19 +94,19 @@ def finish_point(point: Point, touch: Touch, moved: tuple[Vector, Vector] | None
     if moved is not None:
         v = point.rate(*(before + change * h for before, change in zip(point.twist, moved, strict=True)))
     normal = dot(point.normal, v)
-    force = force_at(point, touch, v, h) if moved is not None else ZERO
+    force = force_at(point, state, v, h) if moved is not None else ZERO
     push = normal_force(point, normal, h)
-    pushed = 0.0 if moved is None else touch.closed * push
+    pushed = 0.0 if moved is None else state.closed * push
     slip = slip_speed(point, v, normal)
     fn = select(less(0.0, pushed), pushed, 0.0)
-    cone = touch.across * slip - point.mu * fn
+    cone = state.across * slip - point.mu * fn
     over = select(less(0.0, cone), cone, 0.0)
-    across = secant(point, fn, slip + (h * point.weight) * over)
+    across = friction_damper(point, fn, slip + (h * point.weight) * over)
     reached = less(0.0, point.depth - h * normal)
-    candidate = select(touch.candidate, touch.candidate, reached)
+    candidate = select(state.candidate, state.candidate, reached)
     pushes = less(0.0, push)
-    stays = closing * touch.closed
+    stays = closing * state.closed
     closed = select(stays, 1.0, candidate * pushes)
-    lacking = select(touch.closed, 0.0, candidate * select(pushes, push, 0.0))
+    lacking = select(state.closed, 0.0, candidate * select(pushes, push, 0.0))
     pulls = select(less(pushed, 0.0), -pushed, 0.0)
-    return Found(force, slip, over, pulls, lacking, Touch(across, closed, candidate))
+    return PointResult(force, slip, over, pulls, lacking, PointState(across, closed, candidate))

@@ -21,7 +21,7 @@ from ..articulated_sweeps import NO_FORCE
 from ..kinematics import frame_on_link, velocity
 from ..model.links import Link, Links
 from ..model.messages import INWARD, OUTWARD
-from ..model.segments import Piece, Pieces
+from ..model.segments import Segment, Segments
 from ..motion import STILL
 from .coupled import CoupledStep, suits
 from .couples import EXCESS, Team
@@ -36,8 +36,8 @@ from .pairs import (
     values_of,
     velocities_of,
 )
-from .points import Point
-from .step import ContactStep, Touch
+from .points import TracedContactPoint
+from .step import ContactStepTrace, PointState
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace
@@ -49,30 +49,30 @@ class Seats(NamedTuple):
     """Where the bodies of pairs sit.
 
     Attributes:
-        limbs: the leaf piece of each body, by its number among those of pairs that move. base: the piece on whose last
-            link limbs sit; None: there is none.
+        limbs: the leaf segment of each body, by its number among those of pairs that move. base: the segment on whose
+            last link limbs sit; None: there is none.
     """
 
-    limbs: tuple[Piece, ...]
-    base: Piece | None
+    limbs: tuple[Segment, ...]
+    base: Segment | None
 
 
-def seats_of(links: Links, pieces: Pieces) -> Seats | None:
+def seats_of(links: Links, segments: Segments) -> Seats | None:
     """Return where the bodies of pairs sit; None where a team cannot couple them."""
-    found: list[Piece] = []
+    found: list[Segment] = []
     for body in members(links).bodies:
-        link = links.seats[body].link
+        link = links.placements[body].link
         assert link is not None
-        piece = pieces.of[id(link)]
-        if piece.children or any(one.group is not None for one in piece.links):
+        segment = segments.by_link[id(link)]
+        if segment.children or any(one.shared_dofs is not None for one in segment.links):
             return None
-        found.append(piece)
-    bases = {piece.parent.index: piece.parent for piece in found if piece.parent is not None}
+        found.append(segment)
+    bases = {segment.parent.index: segment.parent for segment in found if segment.parent is not None}
     couples = couples_of(links)
     if len(bases) > 1 or len(couples) > MOST or any(max(bodies) < 0 for bodies, _ in couples):
         return None  # a couple of two bodies that stand still has no limb
     base = next(iter(bases.values()), None)
-    if base is not None and base.links[-1].group is not None:
+    if base is not None and base.links[-1].shared_dofs is not None:
         return None
     return Seats(tuple(found), base)
 
@@ -88,61 +88,61 @@ def couples_of(links: Links) -> tuple[tuple[tuple[int, int], tuple[int, ...]], .
 def by_limbs(scene: Scene) -> bool:
     """Whether limbs side by side can take a step of a scene with pairs."""
     links = Links(scene)
-    pieces = Pieces(links)
-    return pieces.warps > 1 and seats_of(links, pieces) is not None
+    segments = Segments(links)
+    return segments.warps > 1 and seats_of(links, segments) is not None
 
 
-def team(links: Links, pieces: Pieces, alpha: int, first: int) -> Team:
+def team(links: Links, segments: Segments, alpha: int, first: int) -> Team:
     """Return the pairs of a scene for their native code; ``alpha``, ``first``: as there."""
-    seats, scene = seats_of(links, pieces), links.scene
+    seats, scene = seats_of(links, segments), links.scene
     assert seats is not None
     points, eps = zip(*((pair.points, pair.eps) for pair in scene.contact_pairs), strict=True)
-    limbs, warps = (tuple(getattr(piece, name) for piece in seats.limbs) for name in ("index", "warp"))
-    dofs = tuple(piece.weight for piece in seats.limbs)
-    seated = tuple(piece.parent is not None for piece in seats.limbs)
+    limbs, warps = (tuple(getattr(segment, name) for segment in seats.limbs) for name in ("index", "warp"))
+    dofs = tuple(segment.dof_count for segment in seats.limbs)
+    seated = tuple(segment.parent is not None for segment in seats.limbs)
     weights, solids = tuple(inverse_weights(scene)), solids_of(links)[0]
     return Team(couples_of(links), points, eps, weights, limbs, warps, dofs, seated, alpha, first, solids)
 
 
-class PairedPiece(ContactStep):
-    """The part of one piece in a step with pairs; arguments as those of ContactStep."""
+class PairedSegment(ContactStepTrace):
+    """The part of one segment in a step with pairs; arguments as those of ContactStep."""
 
-    looks = False
+    culls = False
 
     def __init__(self, trace: Trace, reports: tuple[str, ...]):
         super().__init__(trace, reports)
         links, self.plan = trace.links, trace.team
         self.at = self.plan.layout
         self.members = members(links)
-        seats = seats_of(links, Pieces(links))
-        assert seats is not None and trace.piece is not None
+        seats = seats_of(links, Segments(links))
+        assert seats is not None and trace.segment is not None
         mine = enumerate(zip(self.members.bodies, seats.limbs, strict=True))
-        self.own = {number: body for number, (body, limb) in mine if limb.index == trace.piece.index}
-        self.is_base = seats.base is not None and seats.base.index == trace.piece.index
+        self.own = {number: body for number, (body, limb) in mine if limb.index == trace.segment.index}
+        self.is_base = seats.base is not None and seats.base.index == trace.segment.index
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
         """Return the stores of a pass; ``trace.couples`` are those that only couples that touch need."""
         self.first: list[Store] = []
         self.twists: list[Store] = []
         found = super().stores(qdd, status)
-        self.trace.begin = [*self.trace.begin, *self.first]
+        self.trace.prologue = [*self.trace.prologue, *self.first]
         return found + self.twists
 
     # -- before the passes -----------------------------------------------------------------------------------------
-    def _press(self, points: list[Point], touches: list[Touch]) -> None:
-        super()._press(points, touches)
+    def _press(self, points: list[TracedContactPoint], states: list[PointState]) -> None:
+        super()._press(points, states)
         trace = self.trace
-        assert trace.piece is not None
+        assert trace.segment is not None
         self.frames = tuple((body, (0.0, 0.0, 0.0)) for body in self.own.values())
         self.seats = {number: frame_on_link(trace, *frame) for number, frame in zip(self.own, self.frames, strict=True)}
         on = [link for link, _ in self.seats.values()]
         place_axes_of(trace, on)
         self.before = velocities_of(trace, on, self.qd)
-        scenery = [-1, *(body for body, seat in trace.links.seats.items() if seat.link is None)]
-        still = scenery if trace.piece.index == 0 else []
+        scenery = [-1, *(body for body, seat in trace.links.placements.items() if seat.link is None)]
+        still = scenery if trace.segment.index == 0 else []
         places = places_of(trace, {*self.own.values(), *still})
         self.first += [Store(INWARD, (self.at["place"] + i,), value) for i, value in places]
-        if trace.piece.index == 0:
+        if trace.segment.index == 0:
             passes = trace.graph.input("passes", 0)  # native code counts them, too
             self._store(self.first, "value", 0, 1, [*values_of(self), passes])
         for number, (link, arm) in self.seats.items():
@@ -150,15 +150,15 @@ class PairedPiece(ContactStep):
             trace.label(link, f"T{number}_")
             (w, v), R = self.before[id(link)], trace.axes[id(link)]
             self._store(self.first, "twist", number, 6, (*velocity(R, w, v, arm), *(R @ w)))
-            trace.ahead += [*(entry for row in R for entry in row), *w, *v]
+            trace.pass_invariants += [*(entry for row in R for entry in row), *w, *v]
             self._add_push(link, self._wrench(number, INWARD))
         if self.is_base:
-            link = trace.piece.links[-1]
+            link = trace.segment.links[-1]
             trace.label(link, "K")
             given = [trace.graph.input(INWARD, self.at["base"] + i) for i in range(27)]
             inertia = Articulated.unpacked(given[:21])
-            known = trace.dampers.get(id(link))
-            trace.dampers[id(link)] = inertia if known is None else known + inertia
+            known = trace.contact_inertia.get(id(link))
+            trace.contact_inertia[id(link)] = inertia if known is None else known + inertia
             self._add_push(link, Vector(given[21:]))
 
     def _store(self, to: list[Store], name: str, number: int, size: int, values: Iterable[Value]) -> None:
@@ -174,8 +174,8 @@ class PairedPiece(ContactStep):
         return Vector((*(n + cross(arm, f)), *f))
 
     def _add_push(self, link: Link, push: Vector) -> None:
-        known = self.trace.pushes.get(id(link))
-        self.trace.pushes[id(link)] = push if known is None else known + push
+        known = self.trace.contact_force.get(id(link))
+        self.trace.contact_force[id(link)] = push if known is None else known + push
 
     # -- passes ----------------------------------------------------------------------------------------------------
     def close(self, done: dict, rates: dict) -> dict:
@@ -184,10 +184,10 @@ class PairedPiece(ContactStep):
             return rates
         trace = self.trace
         mine = [done[id(link)] for link in trace.own_links]
-        trace.carried = [
+        trace.kept_between_sweeps = [
             value for factor in mine for pivot in factor.pivots for value in (*pivot.U, pivot.D, pivot.inverse)
         ]
-        trace.carried += [rate for key in map(id, trace.own_links) for rate in rates[key]]
+        trace.kept_between_sweeps += [rate for key in map(id, trace.own_links) for rate in rates[key]]
         for couple, (bodies, _) in enumerate(self.plan.pairs):
             for side, number in enumerate(bodies):
                 if number in self.own:
@@ -234,7 +234,8 @@ class PairedPiece(ContactStep):
         return stores
 
     def _inward(self, done: dict, against: dict[int, Vector]) -> tuple[dict[int, list[Value]], Vector]:
-        """Return D^-1 [I - H psi K] of forces against links of this piece, by link, and the force against the base."""
+        """Return D^-1 [I - H psi K] of forces against links of this segment, by link, and the force against the
+        base."""
         rates: dict[int, list[Value]] = {}
         force: Vector | None = None
         for link in reversed(self.trace.own_links):
@@ -270,7 +271,7 @@ class PairedPiece(ContactStep):
         return cone, pull, [], missed
 
     def reported(self) -> list[Store]:
-        """Return the stores of what couples report, for the first piece."""
+        """Return the stores of what couples report, for the first segment."""
         first, offset = len(self.trace.links.scene.contact_points), {"contact_gap": 3, "contact_slip": 4}
         stores, read = [], lambda i: self.trace.graph.input(INWARD, self.at["report"] + i)
         for name in self.reports:
@@ -287,5 +288,5 @@ class PairedPiece(ContactStep):
 def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> list[Store]:
     """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world; and the ``reports``"""
     alone = CoupledStep if suits(trace.links) else PairedStep
-    form = alone if trace.piece is None else PairedPiece
+    form = alone if trace.segment is None else PairedSegment
     return form(trace, reports).stores(qdd, status)

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ...scene.pairs import ROUND
+from ...scene.pairs import SWEPT_SEGMENT
 from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Value, sqrt
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, total
 from ..articulated_sweeps import NO_FORCE, pivots, propagate_inward, weighted_products
 from ..kinematics import carried_velocity, frame_on_link, velocity
-from ..model import effective_mass as neutral
+from ..model import effective_mass
 from ..model.links import Link, Links
-from ..model.scene_cache import remembered
+from ..model.scene_cache import cached_by_scene
 from ..motion import hinge_motion
 from ..operational import respond, unit_wrenches
 from . import step as ground
@@ -56,7 +56,7 @@ class Members(NamedTuple):
 def members(links: Links) -> Members:
     """Return the bodies of the pairs of a scene."""
     pairs = [(pair.body, pair.other) for pair in links.scene.contact_pairs]
-    moving = {body for body, seat in links.seats.items() if seat.link is not None}
+    moving = {body for body, seat in links.placements.items() if seat.link is not None}
     bodies = sorted({body for pair in pairs for body in pair} & moving)
     number = {body: i for i, body in enumerate(bodies)}
     return Members(tuple(bodies), tuple((number.get(i, -1), number.get(j, -1)) for i, j in pairs))
@@ -67,7 +67,7 @@ def blocks(links: Links) -> tuple[tuple[int, ...], ...]:
 
     Two bodies move each other if they have a link with dofs in common.
     """
-    ways = [with_ancestors([links.seats[body].link]) for body in members(links).bodies]
+    ways = [with_ancestors([links.placements[body].link]) for body in members(links).bodies]
     found, count = [[-1] * len(ways) for _ in ways], 0
     for i, way in enumerate(ways):
         for j in range(i, len(ways)):
@@ -118,7 +118,8 @@ def solids_of(links: Links) -> tuple[Solids, tuple[int, ...], tuple[tuple[int, t
     of = [[None if one.hull is None else Polyhedron(one.hull.planes, one.hull.edges) for one in both] for both in kinds]
     hull = tuple((hulls.setdefault(a, len(hulls) - 1), hulls.setdefault(b, len(hulls) - 1)) for a, b in of)
     solids = Solids(
-        len(bodies), len(shapes), tuple(sides), tuple((a.kind != ROUND, b.kind != ROUND) for a, b in kinds),
+        len(bodies), len(shapes), tuple(sides),
+        tuple((a.kind != SWEPT_SEGMENT, b.kind != SWEPT_SEGMENT) for a, b in kinds),
         tuple((*a.size.tolist(), *b.size.tolist()) for a, b in kinds), tuple((a.radius, b.radius) for a, b in kinds),
         hull, tuple(one for one in hulls if one is not None),
     )  # fmt: skip
@@ -132,7 +133,7 @@ def places_of(trace: Trace, own: Collection[int]) -> list[tuple[int, Value]]:
     """
     links, identity = trace.links, np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     _, bodies, shapes = solids_of(links)
-    seats = {body: links.seat(body, identity) for body in bodies if body in own}
+    seats = {body: links.placement(body, identity) for body in bodies if body in own}
     needed = with_ancestors([seat.link for seat in seats.values()])
     place_axes_of(trace, [seat.link for seat in seats.values()])
     origins: dict[int | None, Vector] = {None: ZERO}
@@ -150,29 +151,32 @@ def places_of(trace: Trace, own: Collection[int]) -> list[tuple[int, Value]]:
             found += enumerate(origins[key] + axes[key] @ seats[body].offset, start=3 * number)
     for number, (body, pose) in enumerate(shapes):
         if body in own:
-            seat, key = links.seat(body, np.array(pose)), None if seats[body].link is None else id(seats[body].link)
+            seat, key = (
+                links.placement(body, np.array(pose)),
+                None if seats[body].link is None else id(seats[body].link),
+            )
             offset, turn = axes[key] @ (seat.offset - seats[body].offset), axes[key] @ seat.matrix
             found += enumerate([*offset, *(x for row in turn for x in row)], start=3 * len(bodies) + 12 * number)
     return found
 
 
-def values_of(step: ground.ContactStep) -> list[Value]:
+def values_of(step: ground.ContactStepTrace) -> list[Value]:
     """Return stiffness, damping and friction of each pair, and then half of gravity h^2."""
     trace, names = step.trace, ("stiffness", "damping", "friction")
     first, count = len(trace.links.scene.contact_points), len(trace.links.scene.contact_pairs)
-    values = [step.impedance.value(f"contact_{name}", first + pair) for pair in range(count) for name in names]
+    values = [step.joint_laws.value(f"contact_{name}", first + pair) for pair in range(count) for name in names]
     squares = total(x * x for x in trace.links.gravity)
     return [*values, (0.5 * sqrt(squares)) * (step.h * step.h)]
 
 
-class PairedStep(ground.ContactStep):
+class PairedStep(ground.ContactStepTrace):
     """One time step with contacts of bodies with each other, too, as a trace; arguments as those of ContactStep.
 
     Attributes:
         first: stores before the first pass of what the coupling reads.
     """
 
-    looks = False
+    culls = False
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
         """Return the stores of a pass, among them those that the coupling reads, then those after the last pass."""
@@ -180,7 +184,7 @@ class PairedStep(ground.ContactStep):
         self.first: list[Store] = []
         self.response: list[Store] = []
         found = super().stores(qdd, status)
-        self.trace.begin = [*self.trace.begin, *self.first]
+        self.trace.prologue = [*self.trace.prologue, *self.first]
         return self.response + found + [item for name in self.reports for item in self._report_stores(name)]
 
     def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, tuple[Vector, Vector]]) -> dict[int, Value]:
@@ -205,7 +209,7 @@ class PairedStep(ground.ContactStep):
             given = [trace.graph.input(WRENCH, 6 * number + c) for c in range(6)]
             f, n = (R.T @ Vector(given[3 * part : 3 * part + 3]) for part in range(2))
             forces[id(link)] = forces[id(link)] - Vector((*(n + cross(arm, f)), *f))
-        self.response.append(Store(TWIST, (6 * len(seats),), self.kept.closing))
+        self.response.append(Store(TWIST, (6 * len(seats),), self.pass_variables.closing))
         self.response += self._responses(done, frames)
         more, moved = respond(trace, done, forces)
         for key, (w, v) in moved.items():
@@ -226,8 +230,8 @@ class PairedStep(ground.ContactStep):
             (w, v), R = before[id(link)], self.trace.axes[id(link)]
             twist = (*velocity(R, w, v, arm), *(R @ w))
             self.first += [Store(START, (6 * number + c,), value) for c, value in enumerate(twist)]
-        self.trace.ahead += [value for key, pair in before.items() if key for part in pair for value in part]
-        self.trace.ahead += [value for axes in self.trace.axes.values() for row in axes for value in row]
+        self.trace.pass_invariants += [value for key, pair in before.items() if key for part in pair for value in part]
+        self.trace.pass_invariants += [value for axes in self.trace.axes.values() for row in axes for value in row]
 
     def _responses(self, done: dict, frames: tuple) -> list[Store]:
         """Return the stores of the blocks J A0^-1 J*."""
@@ -258,7 +262,7 @@ class PairedStep(ground.ContactStep):
         return stores
 
 
-@remembered
+@cached_by_scene
 def inverse_weights(scene: Scene) -> list[float]:
     """Return SLIP times the inverse weight of each pair [1/kg]: both bodies', means over their shapes, neutral."""
     sides = [(body, shape) for p in scene.contact_pairs
@@ -266,5 +270,5 @@ def inverse_weights(scene: Scene) -> list[float]:
     points = [(body, tuple(point)) for body, shape in sides for point in shape.samples.tolist()]
     weights, of_bodies = np.zeros(len(points)), [body >= 0 for body, _ in points]  # what stands still has none
     frames = tuple(frame for frame in points if frame[0] >= 0)
-    weights[of_bodies] = SLIP / 3.0 * neutral.inverse_weights(scene, frames)
+    weights[of_bodies] = SLIP / 3.0 * effective_mass.inverse_weights(scene, frames)
     return weights.reshape(len(scene.contact_pairs), 2, -1).mean(axis=2).sum(axis=1).tolist()

@@ -9,12 +9,13 @@ link.
 
 A point's path within the step is a parabola: at rates that stay as they are it accelerates by n* J' qd = ``bend`` along
 the normal, so that after the step it is h n* v + h^2 bend / 2 further out, and leaves the ground by h bend faster. The
-spring and the damper see that. Without it a point of a limb that turns fast ends up to h^2 bend / 2 deeper than the
+spring and the damper see that. Without it a point of a segment that turns fast ends up to h^2 bend / 2 deeper than the
 spring has worked for, and energy rises. Where velocity terms are kicks, all is half way, where J* is the mean along the
 path: the point was half a step back before the step, along that path, and n* J v is its mean speed.
 
-A piece works on the points of its links. Those of the link on which other pieces begin are shared among these in equal
-numbers, and only the rest stays: they know that link's motion, and their messages to it carry what the points add.
+A segment works on the points of its links. Those of the link on which other segments begin are shared among these in
+equal numbers, and only the rest stays: they know that link's motion, and their messages to it carry what the points
+add.
 """
 
 from __future__ import annotations
@@ -29,26 +30,26 @@ from ...scene.scene import Scene
 from ...trace.scalars import Value, absolute, branch, is_constant, less, lost, reciprocal, select
 from ...trace.spatial import IDENTITY, ZERO, Vector, cross, dot, total
 from ..kinematics import arm_on_link, carried_velocity, frame_on_link, zero
-from ..model import effective_mass as neutral
+from ..model import effective_mass
 from ..model.links import Link, Links
-from ..model.scene_cache import remembered
-from ..model.segments import Piece, Pieces
+from ..model.scene_cache import cached_by_scene
+from ..model.segments import Segment, Segments
 from ..model.tracing import Trace
-from ..motion import Motion, hinge_motion, link_motion
+from ..motion import VelocityTerms, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
 from ..step.joint_laws import is_number
-from .ground import Corners, Place, Surface, directions, lowest, surface_count, surfaces
+from .ground import Corners, GroundOffset, Surface, directions, lowest, surface_count, surfaces
 from .velocity_kicks import KICK, PATH
 
 if TYPE_CHECKING:
-    from ..step.joint_laws import Impedance
+    from ..step.joint_laws import JointLaws
 
-ARMS = 8  # spheres of a limb up to which their arms are kept, see docs/contact_measured.md
+ARMS = 8  # spheres of a segment up to which their arms are kept, see docs/contact_measured.md
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
 
 
 @dataclasses.dataclass
-class Point:
+class TracedContactPoint:
     """A contact point of a link.
 
     Attributes:
@@ -80,13 +81,13 @@ class Point:
     near: Value | None = None
     lever: Value = 0.0
 
-    def state(self, arm: bool) -> list[Value]:
+    def kept_values(self, arm: bool) -> list[Value]:
         """Return what passes keep: normal, depth, push, damping, motion of the link before; ``arm``: that, too."""
         damping = [] if is_constant(self.d) or self.d.op == "input" else [self.d]
         kept = [*self.arm] if arm else []
         return [*kept, *self.normal, self.depth, self.push, *damping, *self.twist[0], *self.twist[1]]
 
-    def settled(self, *more: Value) -> tuple[Point, list[Value]]:
+    def restrict_to_near(self, *more: Value) -> tuple[TracedContactPoint, list[Value]]:
         """Return the point, and more values that are zero away from its surface; code computes both only near it."""
         if self.near is None or is_constant(self.near):
             return self, list(more)
@@ -115,7 +116,7 @@ class Point:
         return v + cross(w, self.arm)
 
 
-class Carried(NamedTuple):
+class ContactLinkMotion(NamedTuple):
     """Motion at qdd = 0 of a link that carries points, in its axes.
 
     Attributes:
@@ -127,19 +128,19 @@ class Carried(NamedTuple):
     axes: list[Vector]
     origins: list[Value]
     twist: tuple[Vector, Vector]
-    motion: Motion | None
+    motion: VelocityTerms | None
     bend: tuple[Vector, Vector]
     travel: tuple[Vector, Vector]
 
 
 def place_points(
     trace: Trace,
-    impedance: Impedance,
+    joint_laws: JointLaws,
     qd: Callable[[int], Value],
     oriented: bool = False,
     branches: bool = False,
-    carry: Callable[[Link, Carried], Carried] | None = None,
-) -> list[Point]:
+    carry: Callable[[Link, ContactLinkMotion], ContactLinkMotion] | None = None,
+) -> list[TracedContactPoint]:
     """Return the contact points that a trace works on, one for each surface that a point may touch.
 
     ``oriented``: with the inertial directions x, y, z in the axes of their links. ``branches``: code may leave out
@@ -151,35 +152,38 @@ def place_points(
     assert ground is not None
     half_way, still = KICK in trace.inputs, (ZERO, ZERO)
     path = trace.vector(PATH) if half_way else qd
-    place_of_ground = ground_place(impedance)
-    seats = {number: _seat(trace, number, body, place) for number, body, place in _places(trace, impedance)}
+    place_of_ground = ground_offset(joint_laws)
+    seats = {
+        number: _contact_placement(trace, number, body, place)
+        for number, body, place in _point_positions(trace, joint_laws)
+    }
     needed = with_ancestors([link for link, _ in seats.values()] if carry is None else point_links(trace.links))
     asked = directions(ground)
     count = len(asked)
     asked = [*asked, *IDENTITY] if oriented and count < len(IDENTITY) else asked
-    base = Carried(asked, [0.0] * count, still, None, still, still)
+    base = ContactLinkMotion(asked, [0.0] * count, still, None, still, still)
     carried = _carry_outward(trace, base, needed, qd, path, carry)
     found = []
     for number, (on, centre) in seats.items():
         point, mine = scene.contact_points[number], carried[None if on is None else id(on)]
         radius, eps, weight = point.radius, point.eps, weights[number]
-        if trace.links.numbers is not None:
-            radius, eps, weight = trace.links.numbers.of_point(number, "contact", (radius, eps, weight))
+        if trace.links.shared_constants is not None:
+            radius, eps, weight = trace.links.shared_constants.of_point(number, "contact", (radius, eps, weight))
         trace.graph.step = f"contact {number}|c"
         toward = mine.axes[:count]
         arm = centre if is_number(radius, 0.0) else centre - toward[lowest(ground)] * radius
         lever = radius + total(absolute(x) for x in centre)
         at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
         at[lowest(ground)] = at[lowest(ground)] - radius
-        k, d, mu = (impedance.value(f"contact_{name}", number) for name in ("stiffness", "damping", "friction"))
+        k, d, mu = (joint_laws.value(f"contact_{name}", number) for name in ("stiffness", "damping", "friction"))
         turned = mine.axes[-len(IDENTITY) :] if oriented else []
-        h, moving = impedance.h, mine.motion
+        h, moving = joint_laws.h, mine.motion
         bend = mine.bend[1] + cross(mine.bend[0], centre)
         bend = bend if moving is None else bend + moving.whirl @ centre
         w, v = mine.travel
         ahead = 0.5 * h if half_way else h
         moves = [ahead * dot(axis, v + cross(w, centre)) for axis in toward]
-        touched = [_listed_surface(impedance, number)] if isinstance(ground, Listed) else None
+        touched = [_listed_surface(joint_laws, number)] if isinstance(ground, Listed) else None
         for normal, depth, cell, near in touched or surfaces(
             trace.graph, ground, at, place_of_ground, moves, point.walls
         ):
@@ -192,23 +196,23 @@ def place_points(
             material = k, damping, mu, eps, weight
             push = k * below if half_way else k * below - damping * faster
             state = turned, below, push, cell, near if branches else None, lever
-            found.append(Point(number, on, arm, inward, -depth, mine.twist, *material, *state))
+            found.append(TracedContactPoint(number, on, arm, inward, -depth, mine.twist, *material, *state))
     return found
 
 
 def _carry_outward(
     trace: Trace,
-    base: Carried,
+    base: ContactLinkMotion,
     needed: set[int],
     qd: Callable[[int], Value],
     path: Callable[[int], Value],
-    carry: Callable[[Link, Carried], Carried] | None,
-) -> dict[int | None, Carried]:
+    carry: Callable[[Link, ContactLinkMotion], ContactLinkMotion] | None,
+) -> dict[int | None, ContactLinkMotion]:
     """Return what the ``needed`` links carry, by id, from the ``base`` outward; what the base carries is under None.
 
     ``path``: the rates along which q moves in the step; qd itself where that is no other path.
     """
-    carried: dict[int | None, Carried] = {None: base}
+    carried: dict[int | None, ContactLinkMotion] = {None: base}
     for link in trace.active_links:
         if id(link) not in needed:
             continue
@@ -219,7 +223,9 @@ def _carry_outward(
         twist = carried_velocity(place, over.twist, hinge_motion(link, place, qd))
         travel = carried_velocity(place, over.travel, hinge_motion(link, place, path)) if path is not qd else twist
         move = link_motion(link, place, over.motion, path)
-        own = Carried(axes, origins, twist, move, link_acceleration(link, place, move, over.bend, zero), travel)
+        own = ContactLinkMotion(
+            axes, origins, twist, move, link_acceleration(link, place, move, over.bend, zero), travel
+        )
         carried[id(link)] = own if carry is None else carry(link, own)
     return carried
 
@@ -233,87 +239,89 @@ def surface_numbers(scene: Scene, varies: bool) -> list[range]:
 
 def point_links(links: Links) -> list[Link | None]:
     """Return the links that carry the scene's contact points."""
-    return [links.seats[point.body].link for point in links.scene.contact_points]
+    return [links.placements[point.body].link for point in links.scene.contact_points]
 
 
 def own_points(trace: Trace) -> list[tuple[int, ContactPoint]]:
     """Return the contact points that a trace works on, with their numbers."""
-    return points_of(trace.links, trace.piece)
+    return points_of(trace.links, trace.segment)
 
 
 def keeps_arms(trace: Trace) -> bool:
     """Return whether passes keep the arms of points, rather than find each from the normal anew, in three operations.
 
-    Where limbs share the work they do, unless a limb has so many spheres that registers run out.
+    Where segments share the work they do, unless a segment has so many spheres that registers run out.
     """
-    pieces = [] if trace.piece is None else Pieces(trace.links).pieces
-    spheres = (sum(point.radius > 0.0 for _, point in points_of(trace.links, piece)) for piece in pieces)
+    segments = [] if trace.segment is None else Segments(trace.links).all
+    spheres = (sum(point.radius > 0.0 for _, point in points_of(trace.links, segment)) for segment in segments)
     return max(spheres, default=0) <= ARMS
 
 
-def points_of(links: Links, piece: Piece | None) -> list[tuple[int, ContactPoint]]:
-    """Return the contact points that a piece works on, or the whole tree, with their numbers."""
+def points_of(links: Links, segment: Segment | None) -> list[tuple[int, ContactPoint]]:
+    """Return the contact points that a segment works on, or the whole tree, with their numbers."""
     points = list(enumerate(links.scene.contact_points))
-    if piece is None:
+    if segment is None:
         return points
     on: dict[int | None, list[tuple[int, ContactPoint]]] = {}
     for number, point in points:
-        link = links.seats[point.body].link
+        link = links.placements[point.body].link
         on.setdefault(None if link is None else id(link), []).append((number, point))
-    found = on.get(None, []) if piece.index == 0 else []
-    for link in piece.links:
+    found = on.get(None, []) if segment.index == 0 else []
+    for link in segment.links:
         mine = on.get(id(link), [])
-        each = len(mine) // len(piece.children) if piece.children and link is piece.links[-1] else 0
-        found += mine[each * len(piece.children) :]
-    if piece.parent is not None:
-        shared, sharers = on.get(id(piece.parent.links[-1]), []), piece.parent.children
-        each, first = len(shared) // len(sharers), sharers.index(piece)
+        each = len(mine) // len(segment.children) if segment.children and link is segment.links[-1] else 0
+        found += mine[each * len(segment.children) :]
+    if segment.parent is not None:
+        shared, sharers = on.get(id(segment.parent.links[-1]), []), segment.parent.children
+        each, first = len(shared) // len(sharers), sharers.index(segment)
         found += shared[first * each : (first + 1) * each]
     return found
 
 
-def _seat(trace: Trace, number: int, body: int, place: tuple) -> tuple[Link | None, Vector]:
+def _contact_placement(trace: Trace, number: int, body: int, place: tuple) -> tuple[Link | None, Vector]:
     """Return the link that carries a contact point, and the point in the link's frame."""
-    numbers, seat = trace.links.numbers, trace.links.seats[body]
-    if numbers is None or (body, tuple(place)) in trace.links.ports:
+    constants, placement = trace.links.shared_constants, trace.links.placements[body]
+    if constants is None or (body, tuple(place)) in trace.links.ports:
         return frame_on_link(trace, body, place)
     arm = arm_on_link(trace, body, place)
-    fixed = seat.offset + arm  # where the body's place in its link varies, only the arm is a constant
+    fixed = placement.offset + arm  # where the body's place in its link varies, only the arm is a constant
     arm = Vector(0.0 if is_constant(x) else y for x, y in zip(fixed, arm, strict=True))
-    free = seat.offset + Vector(numbers.of_point(number, "arm", arm))
-    fixed = Vector(numbers.of_point(number, "centre", fixed))
-    return seat.link, Vector(y if is_constant(o) else x for o, x, y in zip(seat.offset, free, fixed, strict=True))
+    free = placement.offset + Vector(constants.of_point(number, "arm", arm))
+    fixed = Vector(constants.of_point(number, "centre", fixed))
+    return placement.link, Vector(
+        y if is_constant(o) else x for o, x, y in zip(placement.offset, free, fixed, strict=True)
+    )
 
 
-def _places(trace: Trace, impedance: Impedance) -> Iterator[tuple[int, int, tuple]]:
+def _point_positions(trace: Trace, joint_laws: JointLaws) -> Iterator[tuple[int, int, tuple]]:
     """Yield number, body and place in the body frame of the contact points that a trace works on."""
     listed = isinstance(trace.links.scene.ground, Listed)
     for number, point in own_points(trace):
-        given = tuple(impedance.value("contact_place", PLACE * number + i) for i in range(3)) if listed else ()
+        given = tuple(joint_laws.value("contact_place", PLACE * number + i) for i in range(3)) if listed else ()
         yield number, point.body, given or point.position
 
 
-def _listed_surface(impedance: Impedance, number: int) -> Surface:
+def _listed_surface(joint_laws: JointLaws, number: int) -> Surface:
     """Return the surface near a point that the scene's values describe."""
-    *normal, depth = (impedance.value("contact_place", PLACE * number + i) for i in range(3, PLACE))
+    *normal, depth = (joint_laws.value("contact_place", PLACE * number + i) for i in range(3, PLACE))
     return Surface(Vector(normal), depth)
 
 
-def ground_place(impedance: Impedance) -> Place:
+def ground_offset(joint_laws: JointLaws) -> GroundOffset:
     """Return where the ground is, from the scene's values.
 
     It is nowhere, at a height that is NaN, in a world that asks for a field which the set lacks, and where the field is
     moved aside by NaN, which no cell would show.
     """
-    ground, sets = impedance.scene.ground, impedance.scene.values["ground_field"].size
-    origin = Vector(impedance.value("ground_origin", i) for i in range(3))
-    field = impedance.value("ground_field", 0) if sets else 0.0
+    ground, sets = joint_laws.scene.ground, joint_laws.scene.values["ground_field"].size
+    origin = Vector(joint_laws.value("ground_origin", i) for i in range(3))
+    field = joint_laws.value("ground_field", 0) if sets else 0.0
     if isinstance(ground, HeightField) and not is_constant(field):
         there = less(-0.5, field) * less(field, ground.count - 0.5)
         origin = Vector([*origin[:2], origin[2] + lost(reciprocal(there))])
     if isinstance(ground, HeightField):
         origin = Vector([*origin[:2], origin[2] + lost(origin[0]) + lost(origin[1])])
-    return Place(origin, field, HEIGHTS in impedance.links.variable)
+    return GroundOffset(origin, field, HEIGHTS in joint_laws.links.variable)
 
 
 def with_ancestors(links: list[Link | None]) -> set[int]:
@@ -326,8 +334,8 @@ def with_ancestors(links: list[Link | None]) -> set[int]:
     return found
 
 
-@remembered
+@cached_by_scene
 def inverse_weights(scene: Scene) -> list[float]:
     """Return SLIP times the mean of J Mass^-1 J* over three directions, of each point, neutral, in world 0 [1/kg]."""
     frames = tuple((point.body, point.position) for point in scene.contact_points)
-    return (SLIP / 3.0 * neutral.inverse_weights(scene, frames)).tolist()
+    return (SLIP / 3.0 * effective_mass.inverse_weights(scene, frames)).tolist()

@@ -10,7 +10,7 @@ from __future__ import annotations
 from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Graph, Value, absolute, inverse_root, less, reciprocal, select
-from ..model.scene_cache import remembered
+from ..model.scene_cache import cached_by_scene
 from ..step.joint_laws import CREEP, FRICTION, LIMIT, Law, is_number
 
 SECANT = "secant"
@@ -18,7 +18,7 @@ SECANT = "secant"
 HELD = 2.0  # a limit that only the last pass's rule keeps closed; 1 is closed, 0 open
 
 
-class Kept:
+class PassVariables:
     """Variables that a pass leaves for the next one.
 
     Attributes:
@@ -31,23 +31,23 @@ class Kept:
 
     def __init__(self, graph: Graph, counter: str = "pass"):
         self.graph = graph
-        self.begin: list[Store] = []
-        self.end: list[Store] = []
+        self.initial_stores: list[Store] = []
+        self.stores: list[Store] = []
         number, count = graph.input(counter, 0), graph.input("passes", 0)
         self.first = less(number, 0.5)
         self.closing = less(count - 2.5, number) * less(2.5, count)
 
     def variable(self, first: Value) -> Value:
         """Return a new variable that begins as ``first``."""
-        self.begin.append(Store(SECANT, (len(self.begin),), first))
-        return self.graph.input(SECANT, len(self.begin) - 1)
+        self.initial_stores.append(Store(SECANT, (len(self.initial_stores),), first))
+        return self.graph.input(SECANT, len(self.initial_stores) - 1)
 
     def keep(self, variable: Value, value: Value) -> None:
         """Leave ``value`` in a variable for the next pass."""
-        self.end.append(Store(SECANT, variable.args[1:], value))
+        self.stores.append(Store(SECANT, variable.args[1:], value))
 
 
-class Secant:
+class SecantLaw:
     """A law with bounds of one dof in the passes.
 
     Args:
@@ -56,16 +56,16 @@ class Secant:
             a better one, see :meth:`finish`.
     """
 
-    def __init__(self, kept: Kept, law: Law, qd: Value, u: Value, step_weight: Value):
-        self.kept, self.law, self.qd, self.u, self.step_weight = kept, law, qd, u, step_weight
+    def __init__(self, pass_variables: PassVariables, law: Law, qd: Value, u: Value, step_weight: Value):
+        self.pass_variables, self.law, self.qd, self.u, self.step_weight = pass_variables, law, qd, u, step_weight
         self.inward = -1.0 if law.least is None else 1.0
         if law.role == LIMIT:
             closed = less(0.0, law.depth) + less(0.0, self.inward * law.force)
-            self.variable = kept.variable(select(closed, 1.0, 0.0))
+            self.variable = pass_variables.variable(select(closed, 1.0, 0.0))
         elif law.role == FRICTION:
-            self.variable = kept.variable(law.scale * self._damper(absolute(qd)))
+            self.variable = pass_variables.variable(law.scale * self._damper(absolute(qd)))
         elif law.least is not None and law.most is not None:
-            self.variable = kept.variable(1.0)
+            self.variable = pass_variables.variable(1.0)
         else:
             self.variable = None
 
@@ -89,7 +89,7 @@ class Secant:
         if self._holds_zero:
             return line
         outside = less(self._bound(law.line(self.u)), 0.0)
-        fixed = law.scale * law.bounded(law.line(self.u))
+        fixed = law.scale * law.clip(law.line(self.u))
         return Law(select(outside, fixed, line.force), select(outside, 0.0, line.resistance))
 
     @property
@@ -115,16 +115,16 @@ class Secant:
 
         ``step_weight``: that of this pass's own sweep; None: the one that the law was made with.
         """
-        law, x, kept = self.law, self.variable, self.kept
+        law, x, pass_variables = self.law, self.variable, self.pass_variables
         step_weight = self.step_weight if step_weight is None else step_weight
         if law.role == LIMIT:
             closed = less(0.0, self.inward * law.line(gain))
-            kept.keep(x, select(closed, 1.0, select(kept.closing, select(x, HELD, 0.0), 0.0)))
+            pass_variables.keep(x, select(closed, 1.0, select(pass_variables.closing, select(x, HELD, 0.0), 0.0)))
             return 0.0
         if law.role == FRICTION:
             speed = absolute(self.qd + gain)
             w = speed + step_weight * _positive(x * speed - law.scale)
-            kept.keep(x, law.scale * self._damper(w))
+            pass_variables.keep(x, law.scale * self._damper(w))
             return 0.0
         if x is None:
             return 0.0
@@ -132,7 +132,7 @@ class Secant:
         size, bound = absolute(line), _positive(self._bound(line))
         beyond = _positive(x * size - bound)
         share = size + law.scale * law.resistance * (step_weight * beyond)
-        kept.keep(x, select(less(bound, share), bound * reciprocal(share), 1.0))
+        pass_variables.keep(x, select(less(bound, share), bound * reciprocal(share), 1.0))
         return law.scale * beyond
 
 
@@ -149,7 +149,7 @@ def largest(values: list[Value]) -> Value:
     return found
 
 
-@remembered
+@cached_by_scene
 def single_dofs(scene: Scene) -> frozenset[int]:
     """Return the dofs of the hinges that have one."""
     return frozenset(

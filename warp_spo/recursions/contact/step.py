@@ -4,9 +4,9 @@ Velocity terms, gravity and loads become forces of the hinges once, before the p
 
     (Mass + h S + h J* G J) qdd = tau - bias_force + l - S qd + J* (f0 - G J qd),
 
-where S, l are the hinges' laws (:mod:`.secants`) and G, f0 the contacts' (:mod:`.points`). The first pass closes every
-point that may touch; later passes open those that pull, and close those that the pass before carried below ground; the
-last of three or more opens none. :mod:`warp_spo.reference.contact` is the specification.
+where S, l are the hinges' laws (:mod:`.secant_laws`) and G, f0 the contacts' (:mod:`.points`). The first pass closes
+every point that may touch; later passes open those that pull, and close those that the pass before carried below
+ground; the last of three or more opens none. :mod:`warp_spo.reference.contact` is the specification.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from ..articulated_sweeps import Factors, expand, reduce
 from ..coordinates import integrate_link
 from ..kinematics import zero
 from ..model.links import Link
-from ..model.segments import Piece, Pieces
+from ..model.segments import Segment, Segments
 from ..newton_euler import inverse_dynamics
 from ..step.joint_laws import Law, add_laws
 from ..step.step import GAIN, Step
-from .contact_culling import Crowd, gather
+from .contact_culling import CullGroup, group_points
 from .dampers import SEVERAL, chosen, damper, load
-from .law import Found, Touch, begin_point, finish_point, force_at, normal_force
-from .points import Point, ground_place, keeps_arms, own_points, place_points
-from .secant_laws import Kept, Secant, largest, single_dofs
+from .law import PointResult, PointState, begin_point, finish_point, force_at, normal_force
+from .points import TracedContactPoint, ground_offset, keeps_arms, own_points, place_points
+from .secant_laws import PassVariables, SecantLaw, largest, single_dofs
 from .velocity_kicks import KICK, START
 
 if TYPE_CHECKING:
@@ -43,53 +43,55 @@ NOTHING, NO_PUSH = Articulated.build(lambda i, j: 0.0), Vector([0.0] * 6)  # dam
 REPORTS = ("contact_f", "contact_gap", "contact_slip", "contact_excess")
 
 
-class ContactStep(Step):
+class ContactStepTrace(Step):
     """One time step with contacts as a trace.
 
     Args:
         trace: the evaluation. reports: names among REPORTS of what the step stores beside the state.
 
     Attributes:
-        kicked: velocity terms are kicks before and after the step, see :mod:`.middle`; ``qd`` is after the first one,
-            and all but the hinges' laws is half way; qdd is what the passes find, without kicks.
-        looks: whether many points of a link cost a look where they are far from the ground, see :mod:`.crowds`.
+        has_kicks: velocity terms are kicks before and after the step, see :mod:`.velocity_kicks`; ``qd`` is after the
+            first one, and all but the hinges' laws is at the midpoint; qdd is what the passes find, without kicks.
+        culls: whether passes skip the points of a link that cannot reach the ground, see :mod:`.contact_culling`.
     """
 
-    looks = True
+    culls = True
 
     def __init__(self, trace: Trace, reports: tuple[str, ...]):
-        self.kicked, before, self.kick = KICK in trace.inputs, trace.vector("qd"), trace.vector(KICK)
-        if self.kicked:
-            trace.instead = {"q": trace.vector(START), "qd": lambda dof: before(dof) + self.kick(dof)}
+        self.has_kicks, before, self.kick = KICK in trace.inputs, trace.vector("qd"), trace.vector(KICK)
+        if self.has_kicks:
+            trace.substitutes = {"q": trace.vector(START), "qd": lambda dof: before(dof) + self.kick(dof)}
         super().__init__(trace)
-        trace.instead.pop("q", None)  # the sweep is half way, its laws are not
-        self.reports, self.kept = reports, Kept(trace.graph)
-        self.secants: dict[int, list[Secant]] = {}  # by dof
-        self.crowds: dict[int, Crowd] = {}  # by id of the link
+        trace.substitutes.pop("q", None)  # the sweep is at the midpoint, its laws are not
+        self.reports, self.pass_variables = reports, PassVariables(trace.graph)
+        self.secant_laws: dict[int, list[SecantLaw]] = {}  # by dof
+        self.cull_groups: dict[int, CullGroup] = {}  # by id of the link
         self.excess: list[Value] = []  # of cone, adhesion, effort; largest push of a point that the last pass left open
         self.finished: dict[str, list[Store]] = {name: [] for name in reports}
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
-        """Return the stores of a pass, then those after the last one; ``trace.begin`` are those before the first.
+        """Return the stores of a pass, then those after the last one; ``trace.prologue`` are those before the first.
 
-        For a piece, those after the last pass are the trace's ``news``.
+        For a segment, those after the last pass are the trace's ``final_messages``.
         """
-        trace, kept = self.trace, self.kept
+        trace, pass_variables = self.trace, self.pass_variables
         bias, sent_ahead = self._bias()
-        points, touches, candidates = [], [], []
-        alone = trace.piece is None  # limbs side by side are for GPUs, where branches cost more than they spare
-        for raw in place_points(trace, self.impedance, self.qd, "contact_f" in self.reports, branches=alone):
-            point, first = raw.settled(*self._first(raw))
+        points, states, candidates = [], [], []
+        alone = trace.segment is None  # segments side by side are for GPUs, where branches cost more than they spare
+        for raw in place_points(trace, self.joint_laws, self.qd, "contact_f" in self.reports, branches=alone):
+            point, first = raw.restrict_to_near(*self._first(raw))
             points.append(point)
-            touches.append(self._touch(*first))
+            states.append(self._new_state(*first))
             candidates.append(first[1])
-        self._gather(points, touches, candidates)
+        self._group_points(points, states, candidates)
         arms = keeps_arms(trace)
-        trace.ahead = [*bias.values()]
-        trace.ahead += [value for point in points for value in point.state(arms)]
-        trace.ahead += [value for crowd in self.crowds.values() for value in (crowd.highest, crowd.reach)]
-        self._press(points, touches)
-        trace.stiffened = self._with_resistance
+        trace.pass_invariants = [*bias.values()]
+        trace.pass_invariants += [value for point in points for value in point.kept_values(arms)]
+        trace.pass_invariants += [
+            value for group in self.cull_groups.values() for value in (group.highest, group.reach)
+        ]
+        self._press(points, states)
+        trace.with_step_armature = self._with_resistance
         tau = trace.vector("tau")
         done, rates, sent = self.inward(lambda dof: tau(dof) + self.forces[dof] - bias[dof])
         rates = self.close(done, rates)
@@ -98,43 +100,45 @@ class ContactStep(Step):
         gains = {item.index[0]: self.h * item.value for item in moved if item.array == "out"}
         gains = self.couple(done, gains, alpha)
         passed = [item for item in moved if item.array != "out"]
-        passed += [Store(GAIN, (self._kept.get(dof, dof),), gain) for dof, gain in gains.items()]
+        passed += [Store(GAIN, (self._pass_index.get(dof, dof),), gain) for dof, gain in gains.items()]
         efforts = []
         for link in self.links:
             trace.label(link, "u")
             efforts += [
                 law.finish(gains[dof], self._step_over_inertia(law, link, done))
                 for dof in link.dofs
-                for law in self.secants[dof]
+                for law in self.secant_laws[dof]
             ]
         excess = self.coupled_excess()
-        forces = self._forces(points, touches, alpha, excess)
+        forces = self._forces(points, states, alpha, excess)
         for number, surfaces in forces.items():
             self._report(number, surfaces)
-        trace.ahead += [item.value for item in self.finished.get("contact_gap", ())]  # of the state before the step
+        trace.pass_invariants += [
+            item.value for item in self.finished.get("contact_gap", ())
+        ]  # of the state before the step
         if status or "contact_excess" in self.reports:
             trace.graph.step = "excess|e"
             self.excess = [self._last(largest(values)) for values in (*excess[:2], efforts, excess[2])]
-        trace.begin = sent_ahead + kept.begin
+        trace.prologue = sent_ahead + pass_variables.initial_stores
         after = self._after(qdd, status)
-        if trace.piece is None:
-            return passed + kept.end + after
-        trace.news = after
-        return sent + passed + kept.end
+        if trace.segment is None:
+            return passed + pass_variables.stores + after
+        trace.final_messages = after
+        return sent + passed + pass_variables.stores
 
     def _forces(
-        self, points: list[Point], touches: list[Touch], alpha: dict, excess: tuple[list[Value], ...]
-    ) -> dict[int, list[tuple[Point, Vector, Value]]]:
+        self, points: list[TracedContactPoint], states: list[PointState], alpha: dict, excess: tuple[list[Value], ...]
+    ) -> dict[int, list[tuple[TracedContactPoint, Vector, Value]]]:
         """Return force and slip of the points by number; ``excess`` receives by how much they leave their laws."""
-        found: dict[int, list[tuple[Point, Vector, Value]]] = {}
-        for point, touch in zip(points, touches, strict=True):
+        found: dict[int, list[tuple[TracedContactPoint, Vector, Value]]] = {}
+        for point, state in zip(points, states, strict=True):
             self.trace.graph.step = f"contact {point.number}|f"
-            crowd = self.crowds.get(id(point.link))
-            if crowd is None:
-                one = self._finish(point, touch, alpha)
+            group = self.cull_groups.get(id(point.link))
+            if group is None:
+                one = self._finish(point, state, alpha)
                 some, worst = [(point, one.force, one.slip)], list(one.excess)
-            elif touch is crowd.points[0][1]:
-                some, worst = crowd.finish(self.kept, alpha[id(point.link)], self.h)
+            elif state is group.points[0][1]:
+                some, worst = group.finish(self.pass_variables, alpha[id(point.link)], self.h)
             else:
                 continue
             for each in some:
@@ -146,7 +150,7 @@ class ContactStep(Step):
     def _bias(self) -> tuple[dict[int, Value], list[Store]]:
         """Return velocity terms, unless kicks replace them, gravity and loads as forces of the dofs, and the stores
         that send for them."""
-        found = inverse_dynamics(self.trace, qdd=zero, letter="f", moves=not self.kicked)
+        found = inverse_dynamics(self.trace, qdd=zero, letter="f", moves=not self.has_kicks)
         bias = {item.index[0]: item.value for item in found if item.array == "out"}
         return bias, [item for item in found if item.array != "out"]
 
@@ -160,7 +164,7 @@ class ContactStep(Step):
 
     # -- bodies that touch each other ------------------------------------------------------------------------------
     def close(self, done: dict, rates: dict) -> dict:
-        """Return the rates of a piece, by link, with what forces between its bodies and others add."""
+        """Return the rates of a segment, by link, with what forces between its bodies and others add."""
         return rates
 
     def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, tuple[Vector, Vector]]) -> dict[int, Value]:
@@ -179,108 +183,116 @@ class ContactStep(Step):
         return [], [], [], []
 
     def reported(self) -> list[Store]:
-        """Return the stores of reports on bodies that touch each other that follow after all pieces are done."""
+        """Return the stores of reports on bodies that touch each other that follow after all segments are done."""
         return []
 
     # -- hinges ----------------------------------------------------------------------------------------------------
-    def _pieces(self, link: Link) -> list[Law]:
+    def _active_pieces(self, link: Link) -> list[Law]:
         """Return the laws of each dof in this pass, added up."""
         found = []
-        for dof, laws in zip(link.dofs, self.impedance.laws(link), strict=True):
-            if dof not in self.secants:
-                step_weight = self.h * reciprocal(self.impedance.inertia(dof))
-                u = self._kept_as(GAIN, dof)
-                bent = [law for law in laws if law.bends]
-                self.secants[dof] = [Secant(self.kept, law, self.qd(dof), u, step_weight) for law in bent]
-            pieces = [secant.piece() for secant in self.secants[dof]]
-            found.append(add_laws([law for law in laws if not law.bends] + pieces))
+        for dof, laws in zip(link.dofs, self.joint_laws.laws(link), strict=True):
+            if dof not in self.secant_laws:
+                step_weight = self.h * reciprocal(self.joint_laws.inertia(dof))
+                u = self._pass_variable(GAIN, dof)
+                bounded_laws = [law for law in laws if law.has_bounds]
+                self.secant_laws[dof] = [
+                    SecantLaw(self.pass_variables, law, self.qd(dof), u, step_weight) for law in bounded_laws
+                ]
+            pieces = [secant.piece() for secant in self.secant_laws[dof]]
+            found.append(add_laws([law for law in laws if not law.has_bounds] + pieces))
         self.forces |= {dof: piece.force for dof, piece in zip(link.dofs, found, strict=True)}
         return found
 
-    def _step_over_inertia(self, law: Secant, link: Link, done: Factors) -> Value | None:
+    def _step_over_inertia(self, law: SecantLaw, link: Link, done: Factors) -> Value | None:
         """Return h over the inertia that a law's dof feels in this pass without it; None: that of the neutral pose.
 
         The sweep knows it of hinges with one dof, and it is asked for where kicks are given.
         """
         scene = self.trace.links.scene
-        if not self.kicked or scene.shares_dofs or link.dofs[0] not in single_dofs(scene):
+        if not self.has_kicks or scene.shares_dofs or link.dofs[0] not in single_dofs(scene):
             return None
         D = done[id(link)].pivots[0].D
         felt, least = D - self.h * law.resistance, FELT * self.trace.epsilon * D
         return self.h * reciprocal(select(less(least, felt), felt, least))
 
     # -- contacts --------------------------------------------------------------------------------------------------
-    def _gather(self, points: list[Point], touches: list[Touch], candidates: list[Value]) -> None:
-        """Make crowds of points of one link."""
-        self.crowds = gather(self.trace, self.kept, points, touches, candidates) if self.looks else {}
+    def _group_points(
+        self, points: list[TracedContactPoint], states: list[PointState], candidates: list[Value]
+    ) -> None:
+        """Group the points of each link that has many."""
+        self.cull_groups = (
+            group_points(self.trace, self.pass_variables, points, states, candidates) if self.culls else {}
+        )
 
-    def _begin(self, point: Point) -> Touch:
+    def _begin(self, point: TracedContactPoint) -> PointState:
         """Return the variables of a point."""
-        return self._touch(*self._first(point))
+        return self._new_state(*self._first(point))
 
-    def _touch(self, across: Value, candidate: Value) -> Touch:
+    def _new_state(self, across: Value, candidate: Value) -> PointState:
         """Return variables that begin with these values; a candidate begins closed."""
-        kept = self.kept
-        return Touch(kept.variable(across), kept.variable(candidate), kept.variable(candidate))
+        pass_variables = self.pass_variables
+        return PointState(
+            pass_variables.variable(across), pass_variables.variable(candidate), pass_variables.variable(candidate)
+        )
 
-    def _first(self, point: Point) -> tuple[Value, Value]:
+    def _first(self, point: TracedContactPoint) -> tuple[Value, Value]:
         """Return friction's damper before the first pass, and whether the step may reach the ground."""
         return begin_point(point, self.trace.links.gravity, self.h)
 
-    def _press(self, points: list[Point], touches: list[Touch]) -> None:
+    def _press(self, points: list[TracedContactPoint], states: list[PointState]) -> None:
         """Add dampers and loads of the points to their links."""
-        trace, on = self.trace, dict[int, list[tuple[Point, Touch]]]()
-        for point, touch in zip(points, touches, strict=True):
+        trace, on = self.trace, dict[int, list[tuple[TracedContactPoint, PointState]]]()
+        for point, state in zip(points, states, strict=True):
             if point.link is not None:
-                on.setdefault(id(point.link), []).append((point, touch))
+                on.setdefault(id(point.link), []).append((point, state))
         for key, pressed in on.items():
             trace.label(pressed[0][0].link, "c")  # type: ignore[arg-type]
             floors = [x for x in pressed if x[0].near is None or is_constant(x[0].near)]
             P, push = self._sum(floors)
             if pressed[0][0].near is not None:  # the points of a ground with walls are rarely near it all at once
-                touched = total(point.works(touch.candidate) for point, touch in floors)
+                touched = total(point.works(state.candidate) for point, state in floors)
                 P, push = chosen(touched, (P, push), (NOTHING, NO_PUSH), f"floors of {key}")
             walls = [x for x in pressed if x[0].near is not None and not is_constant(x[0].near)]
             if walls:
                 more, pushed = self._sum(walls)
-                touched = total(touch.candidate for _, touch in walls)
+                touched = total(state.candidate for _, state in walls)
                 P, push = chosen(touched, (P + more, push + pushed), (P, push), f"walls of {key}")
-            if key in self.crowds:
-                P, push = self.crowds[key].damped(P, push)
-            trace.dampers[key], trace.pushes[key] = P, push
+            if key in self.cull_groups:
+                P, push = self.cull_groups[key].damper_and_load(P, push)
+            trace.contact_inertia[key], trace.contact_force[key] = P, push
 
-    def _sum(self, pressed: list[tuple[Point, Touch]]) -> tuple[Articulated, Vector]:
+    def _sum(self, pressed: list[tuple[TracedContactPoint, PointState]]) -> tuple[Articulated, Vector]:
         """Return the sums of dampers and loads of points of one link."""
         h, mine = self.h, [point for point, _ in pressed]
-        along = [h * (touch.closed * (point.k * h + point.d)) for point, touch in pressed]
-        P = damper(mine, [h * touch.across for _, touch in pressed], along)
+        along = [h * (state.closed * (point.k * h + point.d)) for point, state in pressed]
+        P = damper(mine, [h * state.across for _, state in pressed], along)
         if len(pressed) < SEVERAL:
-            loads: dict[int, tuple[Point, Vector]] = {}  # by place, which a floor and its wall share
-            for point, touch in pressed:
+            loads: dict[int, tuple[TracedContactPoint, Vector]] = {}  # by place, which a floor and its wall share
+            for point, state in pressed:
                 first, load_there = loads.get(id(point.arm), (point, ZERO))
-                loads[id(point.arm)] = first, load_there + force_at(point, touch, point.velocity, h)
+                loads[id(point.arm)] = first, load_there + force_at(point, state, point.velocity, h)
             wrenches = [point.wrench(force) for point, force in loads.values()]
             return P, Vector(total(wrench[i] for wrench in wrenches) for i in range(6))
-        return P, load(mine, [touch.closed * normal_force(point, 0.0, h) for point, touch in pressed], P, h)
+        return P, load(mine, [state.closed * normal_force(point, 0.0, h) for point, state in pressed], P, h)
 
-    def _finish(self, point: Point, touch: Touch, alpha: dict) -> Found:
+    def _finish(self, point: TracedContactPoint, state: PointState, alpha: dict) -> PointResult:
         """Return what a pass finds of a point, and keep what the next one reads."""
         moved = None if point.link is None else alpha[id(point.link)]
-        found = finish_point(point, touch, moved, self.h, self.kept.closing)
+        found = finish_point(point, state, moved, self.h, self.pass_variables.closing)
         if point.near is not None:
             mask, left = point.works(found.left.candidate), found.left
             values = (*found.force, *found.excess, left.across, left.closed)
             *force, over, pulls, lacking, across, closed = (
                 branch(mask, x, 0.0, f"force at {point.number}") for x in values
             )
-            left = Touch(across, closed, left.candidate)
-            found = Found(Vector(force), found.slip, over, pulls, lacking, left)
+            left = PointState(across, closed, left.candidate)
+            found = PointResult(Vector(force), found.slip, over, pulls, lacking, left)
         for name in ("across", "candidate", "closed"):
-            self.kept.keep(getattr(touch, name), getattr(found.left, name))
+            self.pass_variables.keep(getattr(state, name), getattr(found.left, name))
         return found
 
     # -- results ---------------------------------------------------------------------------------------------------
-    def _report(self, number: int, surfaces: list[tuple[Point, Vector, Value]]) -> None:
+    def _report(self, number: int, surfaces: list[tuple[TracedContactPoint, Vector, Value]]) -> None:
         """Keep what the caller asks for of a point; of several surfaces the sum of forces, the gap to the nearest."""
         point, force, slip = surfaces[0]
         gap = point.gap
@@ -298,14 +310,14 @@ class ContactStep(Step):
         """Return the variable that has, after the last pass, what ``value`` is in it."""
         if is_constant(value):
             return value
-        variable = self.kept.variable(0.0)
-        self.kept.keep(variable, value)
+        variable = self.pass_variables.variable(0.0)
+        self.pass_variables.keep(variable, value)
         return variable
 
     def _after(self, qdd: bool, status: bool) -> list[Store]:
         """Return the stores after the last pass."""
         trace = self.trace
-        gains = {dof: self._kept_as(GAIN, dof) for link in self.links for dof in link.dofs}
+        gains = {dof: self._pass_variable(GAIN, dof) for link in self.links for dof in link.dofs}
         rates = {dof: self.qd(dof) + gain for dof, gain in gains.items()}
         stores: list[Store] = []
         for link in self.links:
@@ -318,37 +330,37 @@ class ContactStep(Step):
         results = [item.value for item in stores]
         for name in self.reports:
             stores += self.finished[name]
-        if trace.piece is not None:
-            return stores + self._sent_to_the_first(trace.piece, results, status)
+        if trace.segment is not None:
+            return stores + self._sent_to_the_first(trace.segment, results, status)
         if self.excess and any(more := self.last_excess()):
             self.excess = [largest([own, *others]) for own, others in zip(self.excess, more, strict=True)]
         stores += self._excess_stores()
         if status:
             trace.graph.step = "status|s"
-            stores.append(Store("status", (), self._verdict(self._word(results, False))))
+            stores.append(Store("status", (), self._final_status(self._status_word(results, False))))
         return stores
 
-    def _sent_to_the_first(self, own: Piece, results: list[Value], status: bool) -> list[Store]:
-        """Return the stores that send a piece's excess and status to the first piece, which stores the world's."""
+    def _sent_to_the_first(self, own: Segment, results: list[Value], status: bool) -> list[Store]:
+        """Return the stores that send a segment's excess and status to the first segment, which stores the world's."""
         trace, sent = self.trace, []
         if self.excess:
             sent += trace.send("E", own, self.excess)
             if own.index == 0:
-                pieces = Pieces(trace.links).pieces
-                sent_by = zip(*(trace.receive("E", piece) for piece in pieces), strict=True)
+                segments = Segments(trace.links).all
+                sent_by = zip(*(trace.receive("E", segment) for segment in segments), strict=True)
                 kinds = ((*values, *more) for values, more in zip(sent_by, self.last_excess(), strict=True))
                 self.excess = [largest(list(values)) for values in kinds]
-        sent += self._words(own, results) if status else []
+        sent += self._send_status(own, results) if status else []
         first = [*self._excess_stores(), *self.reported()] if own.index == 0 else []
         if first:
-            trace.rounds = [[*first, *(item for turn in trace.rounds for item in turn)]]
+            trace.final_stores = [[*first, *(item for turn in trace.final_stores for item in turn)]]
         return sent
 
     def _excess_stores(self) -> list[Store]:
         asked = self.excess[:3] if "contact_excess" in self.reports else []
         return [Store("contact_excess", (i,), value) for i, value in enumerate(asked)]
 
-    def _verdict(self, worst: Value) -> Value:
+    def _final_status(self, worst: Value) -> Value:
         """Return ``worst``, or CONTACT where the last pass exceeds its laws by too much."""
         scene = self.trace.links.scene
         weight = float(scene.values["body_mass"].sum(axis=1).max()) * 9.81
@@ -366,12 +378,12 @@ class ContactStep(Step):
         points = [number for number, _ in own_points(self.trace)]
         points += range(len(scene.contact_points), scene.contact_count)
         names = ("contact_friction", "contact_stiffness", "contact_damping")
-        values = [self.impedance.value(name, point) for name in names for point in points]
-        place = ground_place(self.impedance)
+        values = [self.joint_laws.value(name, point) for name in names for point in points]
+        place = ground_offset(self.joint_laws)
         values += [*place.origin, place.field]
         return super()._inputs() + [value for value in values if not is_constant(value)]
 
 
 def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> list[Store]:
     """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world; and the ``reports``"""
-    return ContactStep(trace, reports).stores(qdd, status)
+    return ContactStepTrace(trace, reports).stores(qdd, status)

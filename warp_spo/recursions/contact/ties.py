@@ -47,7 +47,7 @@ def couples_of(links: Links) -> list[Couple]:
     """Return the couples of a scene; bodies that fly come first in theirs."""
     found: dict[frozenset, tuple[Link, Link | None, list[int], list[float]]] = {}
     for number, pair in enumerate(links.scene.contact_pairs):
-        first, second = (links.seats[body].link if body >= 0 else None for body in (pair.body, pair.other))
+        first, second = (links.placements[body].link if body >= 0 else None for body in (pair.body, pair.other))
         swap = first is None or (second is not None and flies(second) and not flies(first))
         f, g = (second, first) if swap else (first, second)
         assert f is not None
@@ -64,10 +64,12 @@ def key(link: Link | None) -> int | None:
 def flies(link: Link) -> bool:
     """Whether a link is a body that nothing carries and that carries nothing, without armature."""
     still = all(is_constant(a) and a == 0.0 for a in link.armature)
-    return link.parent is None and link.hinge.unconstrained and not link.children and still and not link.coupled
+    return (
+        link.parent is None and link.hinge.unconstrained and not link.children and still and not link.coupling_inertia
+    )
 
 
-class Plan:
+class TiePlan:
     """The carrier of each link, the links that are aggregated, and the order in which they are eliminated.
 
     Args:

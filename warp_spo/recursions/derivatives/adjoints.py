@@ -28,8 +28,8 @@ from ..kinematics import body_poses, body_velocities, frame_accelerations, frame
 from ..model.links import Link
 from ..momentum import com, com_velocity
 from ..newton_euler import inverse_dynamics
-from ..step.actuation import actuator_force, hinge_laws
-from .power import Entry, Power, Ways
+from ..step.actuation import actuator_force, build_joint_laws
+from .power import Entry, Gradients, Power
 from .tangents import coordinate_directions, tangent_gradient
 
 if TYPE_CHECKING:
@@ -50,15 +50,15 @@ class TreeEquations:
         done, rates, _ = reduce(self.trace, right, moves=False, loads=False)
         return {item.index[0]: item.value for item in expand(self.trace, done, rates, (ZERO, ZERO))}
 
-    def gradient(self, solved: dict[int, Value], qdd: Entry, tau: Entry, right: Entry) -> Ways:
+    def gradient(self, solved: dict[int, Value], qdd: Entry, tau: Entry, right: Entry) -> Gradients:
         """Return the gradient of solved . (tau - Mass qdd - bias_force) by all that tau does not depend on.
 
         Args:
             solved, right: Mass solved = ``right``. qdd, tau: at which the equations hold.
         """
-        return Power(self.trace, lambda dof: -solved[dof], qdd).ways
+        return Power(self.trace, lambda dof: -solved[dof], qdd).gradients
 
-    def put_back(self, stores: list[Store]) -> list[Store]:
+    def project_state(self, stores: list[Store]) -> list[Store]:
         """Return a state after a step, "q_out" and "out", with its constraints enforced; a tree has none."""
         return stores
 
@@ -66,7 +66,7 @@ class TreeEquations:
 def inverse_dynamics_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
     """J* cotangent of inverse dynamics for the arguments ``wrt``"""
     power = Power(trace, trace.vector("cotangent"), trace.vector("qdd"))
-    return power.stores + gradient_stores(trace, power.ways, wrt, wrt)
+    return power.stores + gradient_stores(trace, power.gradients, wrt, wrt)
 
 
 def forward_dynamics_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
@@ -85,8 +85,8 @@ def forward_dynamics_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
     )
     power = Power(trace, lambda dof: -solved(dof), qdd)
     others = tuple(name for name in wrt if name != "tau")
-    stores = power.stores + gradient_stores(trace, power.ways, others, wrt)
-    dofs = [dof for link in trace.own_links for dof in link.dofs if link.leads] if "tau" in wrt else []
+    stores = power.stores + gradient_stores(trace, power.gradients, others, wrt)
+    dofs = [dof for link in trace.own_links for dof in link.dofs if link.is_leader] if "tau" in wrt else []
     return stores + [Store(result_name("tau", wrt), (dof,), solved(dof)) for dof in dofs]
 
 
@@ -94,7 +94,7 @@ def solve_mass_matrix_vjp(trace: Trace, wrt: tuple[str, ...]) -> list[Store]:
     """J* cotangent of Mass^-1 b, which is "qdd": lambda for b, -(d (Mass qdd) / d x)* lambda for the others"""
     solved = TreeEquations(trace).solve(trace.vector("cotangent"))
     power = Power(trace, lambda dof: -solved[dof], trace.vector("qdd"), base=(ZERO, ZERO))
-    stores = gradient_stores(trace, power.ways, tuple(name for name in wrt if name != "b"), wrt)
+    stores = gradient_stores(trace, power.gradients, tuple(name for name in wrt if name != "b"), wrt)
     return stores + [Store(result_name("b", wrt), (dof,), solved[dof]) for dof in solved if "b" in wrt]
 
 
@@ -195,33 +195,33 @@ def step_vjp(trace: Trace, wrt: tuple[str, ...], equations: TreeEquations | None
         trace.label(link, "q")
         values = integrate_link(link, trace.vector("q"), after.__getitem__, h)
         state += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(values)]
-    state = equations.put_back(state)
+    state = equations.project_state(state)
     seeds = [pushed[item.array == "out"](item.index[0]) for item in state]
     results = [item.value for item in state]
     ends = [x for x in ordered(results, after.values()) if x.op == "input" and x.args[0] != "dt"]
     back = reverse(results, [*after.values(), *ends], seeds)
     found = dict(zip((x.args for x in ends), back[len(dofs) :], strict=True))
     rates = dict(zip(dofs, back, strict=False))
-    impedance = hinge_laws(trace, h)
+    joint_laws = build_joint_laws(trace, h)
     forces: dict[int, Value] = {}
     stiff: dict[int, Value] = {}
 
     def stiffened(link: Link) -> Link:
-        for dof, laws in zip(link.dofs, impedance.laws(link), strict=True):
+        for dof, laws in zip(link.dofs, joint_laws.laws(link), strict=True):
             u = h * qdd(dof)
             forces[dof] = total(law.at(u) for law in laws)
             stiff[dof] = h * total(law.piece(u).resistance for law in laws)
         armature = (a + stiff[dof] for a, dof in zip(link.armature, link.dofs, strict=True))
         return dataclasses.replace(link, armature=tuple(armature))
 
-    trace.stiffened = stiffened
+    trace.with_step_armature = stiffened
     solved, tau = equations.solve(lambda dof: h * rates[dof]), trace.vector("tau")
     right = {dof: h * rates[dof] - stiff[dof] * solved[dof] for dof in dofs}
-    ways = equations.gradient(solved, qdd, lambda dof: tau(dof) + forces[dof], right.__getitem__)
+    gradients = equations.gradient(solved, qdd, lambda dof: tau(dof) + forces[dof], right.__getitem__)
     inputs = [x for x in ordered(forces.values()) if x.op == "input"]
     back = reverse(forces.values(), inputs, [solved[dof] for dof in forces])
-    for entry, way in [*ways.items(), *zip((x.args for x in inputs), back, strict=True)]:
-        found[entry] = found.get(entry, 0.0) + way
+    for entry, gradient in [*gradients.items(), *zip((x.args for x in inputs), back, strict=True)]:
+        found[entry] = found.get(entry, 0.0) + gradient
     for dof in dofs:
         found["qd", dof] = found.get(("qd", dof), 0.0) + rates[dof]
         found["tau", dof] = solved[dof]
@@ -272,10 +272,10 @@ def entries(trace: Trace, name: str, found: dict[tuple, Value]) -> Iterable[tupl
         return _value_entries(trace, name, found)
     elif name in COORDINATES:
         places = [
-            (link.coordinate + c,) for link in trace.own_links for c in range(link.hinge.coordinates) if link.leads
+            (link.coordinate + c,) for link in trace.own_links for c in range(link.hinge.coordinates) if link.is_leader
         ]
     else:
-        places = [(dof,) for link in trace.own_links for dof in link.dofs if link.leads]
+        places = [(dof,) for link in trace.own_links for dof in link.dofs if link.is_leader]
     return [(place, found.get((name, *place), 0.0)) for place in places]
 
 

@@ -8,11 +8,11 @@ and every other gradient is that of
     lambda . (tau + l - S qd' - Mass qdd - bias_force) + (J lambda) . f,    f = f0 - G v',
 
 with lambda, qdd and the slopes held, plus that of s'. Forces f, laws l, S and what s' becomes are those of
-:class:`..contact.step.ContactStep` itself, so that a change of a law changes its gradient. No pass is left out: with
-the last one alone, the others frozen, gradients by tau of a quadruped on the ground are wrong by 7 to 34 % in the
-median.
+:class:`..contact.step.ContactStepTrace` itself, so that a change of a law changes its gradient. No pass is left out:
+with the last one alone, the others frozen, gradients by tau of a quadruped on the ground are wrong by 7 to 34 % in
+the median.
 
-A pass takes two traces, so that limbs share both. The first one solves: inward, outward, and the cotangents of what
+A pass takes two traces, so that segments share both. The first one solves: inward, outward, and the cotangents of what
 the pass before left, for which the first trace of that pass waits. The second one takes gradients inward.
 
 Where velocity terms are kicks, s' depends on the inertia that joints feel in the pass, that is, on the articulated
@@ -37,16 +37,23 @@ from ...trace.scalars import Scalar, Value, cut, is_constant, less, ordered, sel
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from ..articulated_sweeps import Factors, eliminate, expand, reduce
 from ..contact.ground import CORNERS
-from ..contact.points import Carried, Point, own_points, place_points, point_links, with_ancestors
+from ..contact.points import (
+    ContactLinkMotion,
+    TracedContactPoint,
+    own_points,
+    place_points,
+    point_links,
+    with_ancestors,
+)
 from ..contact.velocity_kicks import KICK, PATH, START
 from ..coordinates import integrate_link
 from ..kinematics import carried_velocity
 from ..model.links import Link
-from ..model.segments import Piece, Pieces
+from ..model.segments import Segment, Segments
 from ..motion import hinge_motion, whirl
 from .adjoints import entries, result_name
 from .contact_pass import NUMBER, OnePass
-from .power import Entry, Power, Ways
+from .power import Entry, Gradients, Power
 
 if TYPE_CHECKING:
     from ...scene.scene import Scene
@@ -56,13 +63,14 @@ COTANGENT, CAME, SOLVED = "cotangent", "cotangent_came", "solved"
 """The gradient by what a pass leaves, qdd of each dof and then the variables; by what the pass before left, likewise;
 and lambda [world, dof]."""
 INERTIA = "inertia_cotangent"
-"""The gradient by the packed articulated inertia that each piece of :attr:`.OnePass.weighed` carries [world, entry]."""
+"""The gradient by the packed articulated inertia that each segment of :attr:`.OnePass.weighed` carries [world,
+entry]."""
 HEIGHTS_AT = "heights_at"
 """Columns of the heights of a cell in the table of gradients by surface [world, surface]."""
 ORIGIN = "ground_origin"
 OF_DOFS = ("q", "qd", "tau", "target_q", "target_qd", "joint_rest_q", *DOF_VALUES)
-BY_PIECES = (*OF_DOFS, "ctrl", *CONTACT_VALUES, HEIGHTS, ORIGIN, START, KICK, PATH)
-"""Arguments and values whose gradient a limb computes by itself, or by messages between limbs."""
+BY_SEGMENTS = (*OF_DOFS, "ctrl", *CONTACT_VALUES, HEIGHTS, ORIGIN, START, KICK, PATH)
+"""Arguments and values whose gradient a segment computes by itself, or by messages between segments."""
 Twists = dict[int, tuple[Vector, Vector]]
 
 
@@ -82,26 +90,26 @@ class PassAdjoint(OnePass):
         for link in trace.active_links:
             trace.place(link)
         self.points = self._find_points()
-        self.touches = [self._begin(point) for point in self.points]
+        self.states = [self._begin(point) for point in self.points]
         self.qdd = {dof: cut(trace.vector("qdd")(dof)) for dof in self.before}
         self.gains = {dof: self.h * rate for dof, rate in self.qdd.items()}
         self.inner: dict[int, Articulated] = {}
         done = self._factors()
         for link in self.links:
             for dof in link.dofs:
-                for law in self.secants[dof]:
+                for law in self.secant_laws[dof]:
                     law.finish(self.gains[dof], self._step_over_inertia(law, link, done) if id(link) in done else None)
         self.moving = self._twists(self._or_input(self.qdd, "qdd"))
-        touching = zip(self.points, self.touches, strict=True)
-        self.loads = [self._finish(point, touch, self.moving)[0] for point, touch in touching]
+        touching = zip(self.points, self.states, strict=True)
+        self.loads = [self._finish(point, state, self.moving)[0] for point, state in touching]
 
     def _factors(self) -> Factors:
         """Return the factors of the pass by link; {} where no law of these links or further in asks for them."""
         trace, done = self.trace, Factors()
         if not (self._carrier or any(map(self._weighs, self.links))):
             return done
-        self._press(self.points, self.touches)
-        trace.pushes, trace.stiffened = {}, self._with_resistance
+        self._press(self.points, self.states)
+        trace.contact_force, trace.with_step_armature = {}, self._with_resistance
         for link, outward in trace.traversal():
             if outward:
                 trace.place(link)
@@ -110,24 +118,26 @@ class PassAdjoint(OnePass):
         return done
 
     @property
-    def _carrier(self) -> Piece | None:
-        """The piece that this one moves on, if that is one of those weighed."""
-        piece = self.trace.piece
-        above = None if piece is None else piece.parent
+    def _carrier(self) -> Segment | None:
+        """The segment that this one moves on, if that is one of those weighed."""
+        segment = self.trace.segment
+        above = None if segment is None else segment.parent
         return above if above is not None and above.index in self.weighed else None
 
     @property
     def _inertia_message(self) -> list[Value]:
-        """Message of the piece's articulated inertia, with the dampers of its points on the link that it moves on."""
-        piece = self.trace.piece
-        if self._carrier is None or piece is None:
+        """Message of the segment's articulated inertia, with the dampers of its points on the link that it moves on."""
+        segment = self.trace.segment
+        if self._carrier is None or segment is None:
             return []
-        P, link = self.inner[id(piece.links[0])], piece.links[0]
-        return (P + self.trace.dampers[id(link.parent)] if id(link.parent) in self.trace.dampers else P).packed
+        P, link = self.inner[id(segment.links[0])], segment.links[0]
+        return (
+            P + self.trace.contact_inertia[id(link.parent)] if id(link.parent) in self.trace.contact_inertia else P
+        ).packed
 
-    def _find_points(self) -> list[Point]:
+    def _find_points(self) -> list[TracedContactPoint]:
         """Return the contact points."""
-        return place_points(self.trace, self.impedance, self.qd)
+        return place_points(self.trace, self.joint_laws, self.qd)
 
     def _twists(self, rate: Entry) -> Twists:
         """Return (omega; v) of the links by id for the rates of the dofs."""
@@ -144,7 +154,7 @@ class PassAdjoint(OnePass):
         return twist
 
     def _or_input(self, known: dict[int, Value], name: str) -> Entry:
-        """Return entries by dof: those that are known, or of the dofs of other pieces the inputs."""
+        """Return entries by dof: those that are known, or of the dofs of other segments the inputs."""
         read = self.trace.vector(name)
         return lambda dof: known[dof] if dof in known else read(dof)
 
@@ -163,8 +173,10 @@ class PassAdjoint(OnePass):
             seeds += [trace.vector("qd_cotangent")(dof) for dof in link.dofs]
             seeds += [trace.vector("q_cotangent")(link.coordinate + c) for c in range(len(values))]
         seeds = [select(self.last, seed, 0.0) for seed in seeds]
-        results += [item.value for item in self.kept.end]
-        return results, seeds + [self._of_later(COTANGENT, self._dofs + item.index[0]) for item in self.kept.end]
+        results += [item.value for item in self.pass_variables.stores]
+        return results, seeds + [
+            self._of_later(COTANGENT, self._dofs + item.index[0]) for item in self.pass_variables.stores
+        ]
 
     @property
     def _dofs(self) -> int:
@@ -186,17 +198,19 @@ class PassSolve(PassAdjoint):
         return _cut(twist[0]), _cut(twist[1])
 
     def stores(self) -> list[Store]:  # type: ignore[override]
-        """Return the stores of lambda and of the cotangents, and messages to other pieces."""
+        """Return the stores of lambda and of the cotangents, and messages to other segments."""
         trace = self.trace
         on = list({id(point.link): None for point in self.points if point.link is not None})
         results, seeds = self._results()
         stops = [*self.qdd.values(), *(x for key in on for part in self.moving[key] for x in part)]
         direct = _by_each(stops, reverse(results, _distinct(stops), seeds, True))
-        right = {dof: way + self._of_later(COTANGENT, dof) for dof, way in zip(self.qdd, direct, strict=False)}
-        self._press(self.points, self.touches)
+        right = {
+            dof: gradient + self._of_later(COTANGENT, dof) for dof, gradient in zip(self.qdd, direct, strict=False)
+        }
+        self._press(self.points, self.states)
         wrenches = direct[len(self.qdd) :]
-        trace.pushes = {key: Vector(wrenches[6 * at : 6 * at + 6]) for at, key in enumerate(on)}
-        trace.stiffened = self._with_resistance
+        trace.contact_force = {key: Vector(wrenches[6 * at : 6 * at + 6]) for at, key in enumerate(on)}
+        trace.with_step_armature = self._with_resistance
         done, rates, sent = reduce(trace, right.__getitem__, moves=False, loads=False)
         pushed: Twists = {}
         found = expand(trace, done, rates, (ZERO, ZERO), alpha=pushed)
@@ -207,7 +221,7 @@ class PassSolve(PassAdjoint):
             results, seeds = results + self._inertia_message, seeds + trace.receive("Q", self._carrier)
         sent += self._tell(results, seeds)
         power = self._power(solved, pushed)
-        came = self.before | {self._dofs + at: value for at, value in self.kept.variables.items()}
+        came = self.before | {self._dofs + at: value for at, value in self.pass_variables.variables.items()}
         held = [*stops, *solved.values(), *(x for twist in pushed.values() for part in twist for x in part)]
         ends = reverse([*results, power], _distinct([*came.values(), *held]), [*seeds, 1.0], True)
         by_came = zip(came, _by_each(list(came.values()), ends), strict=True)
@@ -218,32 +232,34 @@ class PassSolve(PassAdjoint):
         ]
 
     def _tell(self, results: list[Value], seeds: list[Value]) -> list[Store]:
-        """Return the stores of the gradient by what pieces carry, and those that tell it to the pieces carried."""
+        """Return the stores of the gradient by what segments carry, and those that tell it to the segments carried."""
         trace, found = self.trace, []
         for at, index in enumerate(self.weighed):
-            piece = trace.piece or Pieces(trace.links).pieces[index]
-            if piece.index != index:
+            segment = trace.segment or Segments(trace.links).all[index]
+            if segment.index != index:
                 continue
-            carried = trace.from_children(piece.links[-1], "P", self.inner, Articulated.unpacked)[0].packed
-            ways = _by_each(carried, reverse(results, _distinct(carried), seeds, True))
-            found += [Store(f"{INERTIA}_out", (len(ways) * at + i,), way) for i, way in enumerate(ways)]
-            found += trace.send("Q", piece, ways)
+            carried = trace.from_children(segment.links[-1], "P", self.inner, Articulated.unpacked)[0].packed
+            gradients = _by_each(carried, reverse(results, _distinct(carried), seeds, True))
+            found += [
+                Store(f"{INERTIA}_out", (len(gradients) * at + i,), gradient) for i, gradient in enumerate(gradients)
+            ]
+            found += trace.send("Q", segment, gradients)
         return found
 
 
 class PassGradient(PassAdjoint):
     """Gradients of a pass, and of what follows the last one and precedes the first.
 
-    A piece takes what its points know of the link that it moves on as given, and sends the gradient by that inward.
+    A segment takes what its points know of the link that it moves on as given, and sends the gradient by that inward.
 
     Attributes:
-        given: what the piece takes as given, each scalar cut from its history. passed_on: what its children take.
+        given: what the segment takes as given, each scalar cut from its history. passed_on: what its children take.
     """
 
     def __init__(self, trace: Trace, laws: tuple[int, ...]):
-        piece = trace.piece
-        self._under = None if piece is None or piece.parent is None else piece.parent.links[-1]
-        self._end = piece.links[-1] if piece is not None and piece.children else None
+        segment = trace.segment
+        self._under = None if segment is None or segment.parent is None else segment.parent.links[-1]
+        self._end = segment.links[-1] if segment is not None and segment.children else None
         self._reached = with_ancestors(point_links(trace.links))
         self.given: list[Value] = []
         self.passed_on: list[Value] = []
@@ -255,12 +271,12 @@ class PassGradient(PassAdjoint):
             for corner, height in enumerate(point.cell.heights if point.cell and point.link else ()):
                 self.corners.setdefault(height.key, (height, surface, corner))
 
-    def _find_points(self) -> list[Point]:
-        return place_points(self.trace, self.impedance, self.qd, carry=self._carry)
+    def _find_points(self) -> list[TracedContactPoint]:
+        return place_points(self.trace, self.joint_laws, self.qd, carry=self._carry)
 
-    def _carry(self, link: Link, own: Carried) -> Carried:
+    def _carry(self, link: Link, own: ContactLinkMotion) -> ContactLinkMotion:
         """Return what further links know of a link."""
-        travels = own.travel if self.kicked else ()
+        travels = own.travel if self.has_kicks else ()
         known = [x for row in (*own.axes, own.origins, *own.twist, *own.bend, *travels) for x in row]
         if link is self._end:
             self.passed_on += known
@@ -271,11 +287,11 @@ class PassGradient(PassAdjoint):
         vector = lambda: Vector(itertools.islice(take, 3))  # noqa: E731
         axes, origins = [vector() for _ in own.axes], [*itertools.islice(take, len(own.origins))]
         twist, bend = (vector(), vector()), (vector(), vector())
-        move, travel = own.motion, (vector(), vector()) if self.kicked else twist
+        move, travel = own.motion, (vector(), vector()) if self.has_kicks else twist
         if move is not None:
             assert list(move.spin) == list(own.travel[0])
             move = move._replace(spin=travel[0], whirl=whirl(travel[0]))
-        return Carried(axes, origins, twist, move, bend, travel)
+        return ContactLinkMotion(axes, origins, twist, move, bend, travel)
 
     def _read_twist(self, link: Link, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
         if id(link) not in self._reached:
@@ -289,12 +305,13 @@ class PassGradient(PassAdjoint):
         return apart
 
     def stores(self, wrt: tuple[str, ...]) -> list[Store]:  # type: ignore[override]
-        """Return the stores of the gradients by ``wrt``, those of later passes added, and messages to other pieces."""
-        trace, kept = self.trace, self.kept
+        """Return the stores of the gradients by ``wrt``, those of later passes added, and messages to other
+        segments."""
+        trace, pass_variables = self.trace, self.pass_variables
         results, seeds = self._results()
-        results += [self._power(self.solved, self.pushed), *(item.value for item in kept.begin)]
-        came = [trace.graph.input(CAME, self._dofs + item.index[0]) for item in kept.begin]
-        seeds += [1.0, *(select(kept.first, way, 0.0) for way in came)]
+        results += [self._power(self.solved, self.pushed), *(item.value for item in pass_variables.initial_stores)]
+        came = [trace.graph.input(CAME, self._dofs + item.index[0]) for item in pass_variables.initial_stores]
+        seeds += [1.0, *(select(pass_variables.first, gradient, 0.0) for gradient in came)]
         packed = self._inertia_message
         if self._carrier is not None:
             first = len(packed) * self.weighed.index(self._carrier.index)
@@ -302,10 +319,10 @@ class PassGradient(PassAdjoint):
                 results + packed,
                 seeds + [trace.graph.input(INERTIA, first + i) for i in range(len(packed))],
             )
-        for piece in trace.piece.children if trace.piece is not None else ():
+        for segment in trace.segment.children if trace.segment is not None else ():
             results += self.passed_on
-            seeds += trace.receive("G", piece)[: len(self.passed_on)]
-        held = [*self.qdd.values(), *self.solved.values(), *self.before.values(), *kept.variables.values()]
+            seeds += trace.receive("G", segment)[: len(self.passed_on)]
+        held = [*self.qdd.values(), *self.solved.values(), *self.before.values(), *pass_variables.variables.values()]
         stops = _distinct([*self.given, *held])
         leaves = [x for x in ordered(results, stops) if x.op == "input"]
         heights = [x for x, *_ in self.corners.values()] if HEIGHTS in wrt else []
@@ -313,50 +330,50 @@ class PassGradient(PassAdjoint):
         sent = trace.send_to_parent("G", trace.own_links[0], _by_each(self.given, back))
         sent += trace.send_to_parent("P", trace.own_links[0], packed) if packed else []
         rest = iter(back[len(stops) :])
-        ways: Ways = dict(zip((x.args for x in leaves), rest, strict=False))
-        for (_, *at), way in zip(self.corners.values(), rest, strict=False):
-            ways[(HEIGHTS, *at)] = way
+        gradients: Gradients = dict(zip((x.args for x in leaves), rest, strict=False))
+        for (_, *at), gradient in zip(self.corners.values(), rest, strict=False):
+            gradients[(HEIGHTS, *at)] = gradient
         multiplier, qdd = self._or_input(self.solved, SOLVED), self._or_input(self.qdd, "qdd")
-        power = Power(trace, lambda dof: -multiplier(dof), qdd, moves=not self.kicked)
-        for entry, way in power.ways.items():
-            ways[entry] = ways.get(entry, 0.0) + way
+        power = Power(trace, lambda dof: -multiplier(dof), qdd, moves=not self.has_kicks)
+        for entry, gradient in power.gradients.items():
+            gradients[entry] = gradients.get(entry, 0.0) + gradient
         for dof, value in self.solved.items():
-            ways["tau", dof] = value
+            gradients["tau", dof] = value
         found: list[Store] = []
         for name in wrt:
             if name == HEIGHTS:
                 cells = zip(self.surfaces, (point.cell for point in self.points), strict=True)
                 found += [Store(f"{HEIGHTS_AT}_bar", (at,), cell.first) for at, cell in cells if cell is not None]
-            if name == ORIGIN and trace.piece is not None:
-                sent += self._add_origins(trace.piece, ways)
-                if trace.piece.parent is not None:
+            if name == ORIGIN and trace.segment is not None:
+                sent += self._add_origins(trace.segment, gradients)
+                if trace.segment.parent is not None:
                     continue
-            for index, value in self._entries(name, ways):
+            for index, value in self._entries(name, gradients):
                 found.append(Store(result_name(name, wrt), index, self._of_later(f"{name}_later", *index) + value))
         return [*sent, *power.stores, *found]
 
-    def _add_origins(self, own: Piece, ways: Ways) -> list[Store]:
-        """Add to the gradient by the ground's origin those of the pieces further out; return what sends it inward."""
-        for piece in own.children:
-            for i, more in enumerate(self.trace.receive("O", piece)):
-                ways[ORIGIN, i] = ways.get((ORIGIN, i), 0.0) + more
-        sums = [ways.get((ORIGIN, i), 0.0) for i in range(3)]
+    def _add_origins(self, own: Segment, gradients: Gradients) -> list[Store]:
+        """Add to the gradient by the ground's origin those of the segments further out; return what sends it inward."""
+        for segment in own.children:
+            for i, more in enumerate(self.trace.receive("O", segment)):
+                gradients[ORIGIN, i] = gradients.get((ORIGIN, i), 0.0) + more
+        sums = [gradients.get((ORIGIN, i), 0.0) for i in range(3)]
         return self.trace.send_to_parent("O", own.links[0], sums)
 
-    def _entries(self, name: str, ways: Ways) -> Iterable[tuple[tuple[int, ...], Value]]:
+    def _entries(self, name: str, gradients: Gradients) -> Iterable[tuple[tuple[int, ...], Value]]:
         """Return (index, gradient) of every entry of an argument or value that this trace works on.
 
         Of heights, the index is a surface and a corner.
         """
         if name == HEIGHTS:
             places: Iterable[tuple[int, ...]] = itertools.product(self.surfaces, range(CORNERS))
-        elif self.trace.piece is not None and name in CONTACT_VALUES:
+        elif self.trace.segment is not None and name in CONTACT_VALUES:
             places = [(number,) for number, _ in own_points(self.trace)]
-        elif self.trace.piece is not None and name == "ctrl":
+        elif self.trace.segment is not None and name == "ctrl":
             places = [(number,) for number in self._controls(list(self.before))]
         else:
-            return entries(self.trace, name, ways)
-        return [(place, ways.get((name, *place), 0.0)) for place in places]
+            return entries(self.trace, name, gradients)
+        return [(place, gradients.get((name, *place), 0.0)) for place in places]
 
 
 def contact_solve(trace: Trace, laws: tuple[int, ...]) -> list[Store]:
@@ -370,12 +387,12 @@ def contact_gradient(trace: Trace, laws: tuple[int, ...], wrt: tuple[str, ...], 
 
 
 def divides(scene: Scene, variable: Collection[str], inputs: Collection[str], wrt: Collection[str]) -> bool:
-    """Return whether limbs can share the gradients of a pass."""
+    """Return whether segments can share the gradients of a pass."""
     alone = all(len(actuator.hinges) == 1 for actuator in scene.actuators)
     lifted = "body_gravcomp" in variable or bool(scene.values["body_gravcomp"].any())
     alone &= len(scene.tree.roots) == 1 or ORIGIN not in wrt  # its gradient is added up towards the root
     alone &= "body_f" not in inputs
-    return alone and not lifted and set(wrt) <= set(BY_PIECES)
+    return alone and not lifted and set(wrt) <= set(BY_SEGMENTS)
 
 
 def _distinct(values: Iterable[Value]) -> list[Scalar]:

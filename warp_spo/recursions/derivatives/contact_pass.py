@@ -2,7 +2,7 @@
 
 Gradients need that of every pass. The variables of a pass lie in a row [world, variable]: first those of the hinges'
 laws, link after link, then three for each surface that a point may touch. The order is the same for the whole tree and
-for its pieces.
+for its segments.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 from ...scene.contacts import HEIGHTS
 from ...trace.emission import Store
 from ...trace.scalars import Value, cut, reciprocal, select
-from ..contact.points import Point, own_points, surface_numbers
-from ..contact.secant_laws import Kept, single_dofs
-from ..contact.step import ContactStep, Touch
+from ..contact.points import TracedContactPoint, own_points, surface_numbers
+from ..contact.secant_laws import PassVariables, single_dofs
+from ..contact.step import ContactStepTrace, PointState
 from ..model.links import Link, Links
-from ..model.segments import Pieces
+from ..model.segments import Segments
 from ..step.joint_laws import LIMIT, Law
 from ..step.step import GAIN
 
@@ -30,10 +30,10 @@ ROW, BEFORE = "row", "qdd_before"
 """Inputs that the pass before left: variables [world, variable] and qdd [world, dof]."""
 NUMBER = "number"
 """Input that counts the passes from zero; "passes" is how many there are."""
-OF_POINT = len(Touch._fields)  # variables of a surface
+OF_POINT = len(PointState._fields)  # variables of a surface
 
 
-class RowKept(Kept):
+class RowVariables(PassVariables):
     """Variables of a pass that is a kernel by itself, in ROW.
 
     Attributes:
@@ -48,16 +48,16 @@ class RowKept(Kept):
 
     def variable(self, first: Value) -> Value:
         at = next(self.places)
-        self.begin.append(Store(ROW, (at,), first))
+        self.initial_stores.append(Store(ROW, (at,), first))
         self.variables[at] = cut(select(self.first, first, self.graph.input(ROW, at)))
         return self.variables[at]
 
     def keep(self, variable: Value, value: Value) -> None:
         at = next(place for place, one in self.variables.items() if one is variable)
-        self.end.append(Store(f"{ROW}_out", (at,), value))
+        self.stores.append(Store(f"{ROW}_out", (at,), value))
 
 
-class OnePass(ContactStep):
+class OnePass(ContactStepTrace):
     """One pass of a step with contacts, which reads what the pass before left.
 
     Args:
@@ -69,11 +69,11 @@ class OnePass(ContactStep):
             that the trace's points may touch.
     """
 
-    kept: RowKept
+    pass_variables: RowVariables
 
     def __init__(self, trace: Trace, laws: tuple[int, ...] | None):
         super().__init__(trace, ())
-        self.kept = RowKept(trace)
+        self.pass_variables = RowVariables(trace)
         numbers = surface_numbers(trace.links.scene, HEIGHTS in trace.links.variable)
         self.surfaces = [surface for number, _ in own_points(trace) for surface in numbers[number]]
         self._next = iter(self.surfaces)
@@ -82,63 +82,74 @@ class OnePass(ContactStep):
         self._count = sum(laws or ())
         self.active: dict[int, Law] = {}
         dofs = sorted(dof for link in self.links for dof in link.dofs)
-        self.before = {dof: cut(select(self.kept.first, 0.0, trace.graph.input(BEFORE, dof))) for dof in dofs}
+        self.before = {dof: cut(select(self.pass_variables.first, 0.0, trace.graph.input(BEFORE, dof))) for dof in dofs}
         self.counted = tuple(self._count_laws(link) for link in self.links)
 
     @functools.cached_property
     def weighed(self) -> tuple[int, ...]:
-        """Numbers of the pieces that carry others whose inertia counts in what laws leave for the next pass."""
-        if not self.kicked:
+        """Numbers of the segments that carry others whose inertia counts in what laws leave for the next pass."""
+        if not self.has_kicks:
             return ()
-        pieces = Pieces(self.trace.links).pieces
-        own = {piece.index for piece in pieces if any(self._weighs(link) for link in piece.links if link.leads)}
-        chains = {piece.index: {piece.index, *(further.index for further in piece.ancestors)} for piece in pieces}
-        return tuple(piece.index for piece in pieces if piece.children and own & chains[piece.index])
+        segments = Segments(self.trace.links).all
+        own = {
+            segment.index for segment in segments if any(self._weighs(link) for link in segment.links if link.is_leader)
+        }
+        chains = {
+            segment.index: {segment.index, *(further.index for further in segment.ancestors)} for segment in segments
+        }
+        return tuple(segment.index for segment in segments if segment.children and own & chains[segment.index])
 
     def _weighs(self, link: Link) -> bool:
         """Whether what a law of the link leaves for the next pass depends on the inertia that its dof feels."""
         scene = self.trace.links.scene
-        if not self.kicked or scene.shares_dofs or link.dofs[0] not in single_dofs(scene):
+        if not self.has_kicks or scene.shares_dofs or link.dofs[0] not in single_dofs(scene):
             return False
-        return any(law.bends and law.role != LIMIT for laws in self.impedance.laws(link) for law in laws)
+        return any(law.has_bounds and law.role != LIMIT for laws in self.joint_laws.laws(link) for law in laws)
 
     def _count_laws(self, link: Link) -> int:
         """Make the variables of the laws of a link; return how many they are."""
-        known = len(self.kept.variables)
-        self.kept.places = itertools.count(self._starts.get(id(link), known))
-        self._pieces(link)
-        return len(self.kept.variables) - known
+        known = len(self.pass_variables.variables)
+        self.pass_variables.places = itertools.count(self._starts.get(id(link), known))
+        self._active_pieces(link)
+        return len(self.pass_variables.variables) - known
 
-    def _kept_as(self, name: str, dof: int) -> Value:
-        return self.h * self.before[dof] if name == GAIN else super()._kept_as(name, dof)
+    def _pass_variable(self, name: str, dof: int) -> Value:
+        return self.h * self.before[dof] if name == GAIN else super()._pass_variable(name, dof)
 
-    def _pieces(self, link: Link) -> list[Law]:
-        found = super()._pieces(link)
+    def _active_pieces(self, link: Link) -> list[Law]:
+        found = super()._active_pieces(link)
         self.active |= zip(link.dofs, found, strict=True)
         return found
 
-    def _touch(self, across: Value, candidate: Value) -> Touch:
-        self.kept.places = itertools.count(self._count + OF_POINT * next(self._next))
-        return super()._touch(across, candidate)
+    def _new_state(self, across: Value, candidate: Value) -> PointState:
+        self.pass_variables.places = itertools.count(self._count + OF_POINT * next(self._next))
+        return super()._new_state(across, candidate)
 
-    def _gather(self, points: list[Point], touches: list[Touch], candidates: list[Value]) -> None:
-        """Make no crowds: every point is computed in every pass, and what a pass leaves are variables of points."""
+    def _group_points(
+        self, points: list[TracedContactPoint], states: list[PointState], candidates: list[Value]
+    ) -> None:
+        """Make no groups: every point is computed in every pass, and what a pass leaves are variables of points."""
 
     def forward(self) -> list[Store]:
-        """Return the stores of what the pass leaves, and messages to other pieces."""
+        """Return the stores of what the pass leaves, and messages to other segments."""
         trace = self.trace
-        dofs = {self._kept.get(dof, dof): dof for dof in self.before}
+        dofs = {self._pass_index.get(dof, dof): dof for dof in self.before}
         stores = self.stores(qdd=False, status=False)
-        sent = [item for item in trace.begin if item.array != ROW]
-        trace.begin, trace.ahead, trace.news, trace.rounds = [], [], [], []  # there is no loop
-        after = (GAIN, "out", "q_out", *(item.array for item in self.kept.end))
+        sent = [item for item in trace.prologue if item.array != ROW]
+        trace.prologue, trace.pass_invariants, trace.final_messages, trace.final_stores = (
+            [],
+            [],
+            [],
+            [],
+        )  # there is no loop
+        after = (GAIN, "out", "q_out", *(item.array for item in self.pass_variables.stores))
         sent += [item for item in stores if item.array not in after]
         gains = [
             Store("out", (dofs[item.index[0]],), item.value * reciprocal(self.h))
             for item in stores
             if item.array == GAIN
         ]
-        return sent + gains + self.kept.end
+        return sent + gains + self.pass_variables.stores
 
 
 def contact_pass(trace: Trace, laws: tuple[int, ...]) -> list[Store]:
@@ -151,7 +162,7 @@ def count_laws(trace: Trace) -> tuple[int, ...]:
     return OnePass(trace, None).counted
 
 
-def weighed_pieces(trace: Trace) -> tuple[int, ...]:
+def weighed_segments(trace: Trace) -> tuple[int, ...]:
     """Return :attr:`OnePass.weighed`."""
     return OnePass(trace, None).weighed
 

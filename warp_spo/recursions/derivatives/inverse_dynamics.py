@@ -14,10 +14,10 @@ from ...trace.scalars import Value
 from ...trace.spatial import ZERO, Rigid, Vector, cross, dot
 from .. import composite, motion, newton_euler
 from ..model import messages
-from ..model.links import Link, Placed
-from ..motion import STILL, Motion
+from ..model.links import Link, LinkPlacement
+from ..motion import STILL, VelocityTerms
 from . import sensitivity
-from .sensitivity import CarriedSums, Row, Sensitivity
+from .sensitivity import CarriedSums, Sensitivity, SensitivityAdjoint
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace
@@ -36,11 +36,11 @@ def inverse_dynamics_derivatives(trace: Trace, mass: bool = True) -> list[Store]
     letters = messages.needed(LETTERS, trace.inputs)
     inner: dict[str, dict[int, list[Value]]] = {letter: {} for letter in letters}  # what links hand to their parents
     drifts: dict[int, Vector] = {}
-    shared: dict[int, tuple[Row, list]] = {}  # of groups, by dof
+    shared: dict[int, tuple[SensitivityAdjoint, list]] = {}  # of groups, by dof
     stores: list[Store] = []
     for link, outward in trace.traversal():
         key, over = id(link), link.parent
-        parent: Motion = STILL if over is None else trace.motions[id(over)]
+        parent: VelocityTerms = STILL if over is None else trace.motions[id(over)]
         if outward:
             trace.place(link, moves)
             place = trace.places[key]
@@ -75,11 +75,11 @@ def inverse_dynamics_derivatives(trace: Trace, mass: bool = True) -> list[Store]
                 inner[letter][key] = values[letter]
                 stores += trace.send_to_parent(letter, link, values[letter])
         stores += _entries(trace, link, all_in, (n, f), own, drifts, shared)
-        for (i, j), x in link.coupled.items():
+        for (i, j), x in link.coupling_inertia.items():
             a, b = link.dofs[i], link.dofs[j]
             stores += [Store("out", (QDD, a, b), x), Store("out", (QDD, b, a), x)]
     stores = [item for item in stores if mass or item.array != "out" or item.index[0] != QDD]
-    return merge(stores) if trace.links.shared else stores
+    return merge(stores) if trace.links.shares_dofs else stores
 
 
 def _wrenches(trace: Trace, link: Link) -> list[tuple[Vector, Vector, Vector]]:
@@ -94,10 +94,12 @@ def _wrenches(trace: Trace, link: Link) -> list[tuple[Vector, Vector, Vector]]:
     return found
 
 
-def _sum_of_links(one: tuple[Row, list], row: Row, blocks: list) -> tuple[Row, list]:
+def _sum_of_links(
+    one: tuple[SensitivityAdjoint, list], row: SensitivityAdjoint, blocks: list
+) -> tuple[SensitivityAdjoint, list]:
     """Return the sums of rows and of forces of two links of a group, as their parent feels them."""
     both = zip(one[1], blocks, strict=True)
-    return Row(*(a + b for a, b in zip(one[0], row, strict=True))), [
+    return SensitivityAdjoint(*(a + b for a, b in zip(one[0], row, strict=True))), [
         (block, n + n_other, f + f_other) for (block, n, f), (_, n_other, f_other) in both
     ]
 
@@ -139,9 +141,9 @@ def _entries(
             pose = trace.places[id(over)].pose
             row = row.to_parent(trace.places[id(over)], drifts[id(over)])
             blocks = [*((block, *pose.force_to_parent(n, f)) for block, n, f in blocks[:2]), (QDD, row.w, row.v)]
-            if over is link and link.group is not None:  # links of a group go on together from the last one
+            if over is link and link.shared_dofs is not None:  # links of a group go on together from the last one
                 row, blocks = shared[dof] = _sum_of_links(shared[dof], row, blocks) if dof in shared else (row, blocks)
-                if not link.closes:
+                if not link.is_last:
                     break
             over = over.parent
             for block, n, f in blocks:
@@ -198,10 +200,10 @@ def mass_matrix_derivative(trace: Trace) -> list[Store]:
                             continue
                         value = value + _power(changes[j], momenta[i])
                     stores += [Store("out", (*at, dof), value) for at in {(i, j), (j, i)}]
-    return merge(stores) if trace.links.shared else stores
+    return merge(stores) if trace.links.shares_dofs else stores
 
 
-def _column_changes(link: Link, place: Placed, heads: dict, dof: int) -> dict[int, tuple[Vector, Vector]]:
+def _column_changes(link: Link, place: LinkPlacement, heads: dict, dof: int) -> dict[int, tuple[Vector, Vector]]:
     """Changes of the columns H*, in the link's axes, when the link moves by one of its own dofs."""
     theta, d = heads[dof]
     changes = link.hinge.column_changes(place)

@@ -15,14 +15,14 @@ from ...trace.differentiation import reverse
 from ...trace.emission import Store
 from ...trace.scalars import Value, cut, is_constant, ordered
 from ...trace.spatial import ZERO, Matrix, Rigid, Vector, cross, dot, skew
-from ..model.links import Link, Placed
+from ..model.links import Link, LinkPlacement
 from ..motion import armature_forces, hinge_motion, own_bias, whirl
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace
 
 Entry = Callable[[int], Value]
-Ways = dict[tuple, Value]
+Gradients = dict[tuple, Value]
 """Gradient of the sum, by name and index of an input of the trace."""
 
 
@@ -72,7 +72,7 @@ class FromParent(NamedTuple):
     apart: list[Vector]
 
     @classmethod
-    def of(cls, place: Placed, parent: Seen, axes: Matrix) -> FromParent:
+    def of(cls, place: LinkPlacement, parent: Seen, axes: Matrix) -> FromParent:
         pose, (spin, w, v, mu_w, mu_v) = place.pose, parent.moving
         mu = pose.motion_to_child(mu_w, mu_v)
         raw = [pose.to_child(spin), pose.to_child(w), pose.to_child(v + parent.turning @ pose.l), *mu, *axes]
@@ -80,7 +80,7 @@ class FromParent(NamedTuple):
 
 
 class Power:
-    """The sum for one trace, of a whole scene or of a piece, and its gradient.
+    """The sum for one trace, of a whole scene or of a segment, and its gradient.
 
     Args:
         multiplier, qdd: lambda and the accelerations, by dof: inputs, or what other recursions make.
@@ -88,7 +88,7 @@ class Power:
 
     Attributes:
         ways: gradient by entries of "q", "qd", "qdd", "body_f" and of the scene's values, by name and index.
-        stores: messages to other pieces. forces: tau, by dof.
+        stores: messages to other segments. forces: tau, by dof.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Power:
         base: tuple[Vector, Vector] | None = None,
         moves: bool = True,
     ):
-        self.trace, self.ways, self.stores = trace, Ways(), list[Store]()
+        self.trace, self.gradients, self.stores = trace, Gradients(), list[Store]()
         self.forces: dict[int, Value] = {}
         self.rate: Entry = trace.vector("qd") if moves else lambda dof: 0.0
         self.multiplier, self.qdd = lambda dof: cut(multiplier(dof)), lambda dof: cut(qdd(dof))
@@ -164,17 +164,17 @@ class Power:
         return self._back(_flat(carried.raw), bars, [*ends, *turn])[: len(ends)]
 
     def _back(self, outputs: list[Value], bars: list[Value], ends: list[Value]) -> list[Value]:
-        """Return the gradient by ``ends``, each scalar counted once; gradients by inputs are added to ``ways``."""
+        """Return the gradient by ``ends``, each scalar counted once; gradients by inputs are added to ``gradients``."""
         stops = list({x.key: x for x in ends if not is_constant(x)}.values())
         leaves = [x for x in ordered(outputs, stops) if x.op == "input"]
         found = reverse(outputs, [*stops, *leaves], bars)
-        for x, way in zip(leaves, found[len(stops) :], strict=True):
-            self._add(x.args, way)
+        for x, gradient in zip(leaves, found[len(stops) :], strict=True):
+            self._add(x.args, gradient)
         left = dict(zip((x.key for x in stops), found, strict=False))
         return [0.0 if is_constant(x) else left.pop(x.key, 0.0) for x in ends]
 
-    def _add(self, entry: tuple, way: Value) -> None:
-        self.ways[entry] = self.ways.get(entry, 0.0) + way
+    def _add(self, entry: tuple, gradient: Value) -> None:
+        self.gradients[entry] = self.gradients.get(entry, 0.0) + gradient
 
 
 def turning_of(moving: Moving) -> Matrix:

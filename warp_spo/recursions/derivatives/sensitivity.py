@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 from ...trace.scalars import Value
 from ...trace.spatial import ZERO, Matrix, Rigid, Vector, cross, dot, skew, symmetric
-from ..model.links import Link, Placed
-from ..motion import NONE, Motion, carry_acceleration, hinge_motion, whirl
+from ..model.links import Link, LinkPlacement
+from ..motion import NONE, VelocityTerms, carry_acceleration, hinge_motion, whirl
 
 
 class Sensitivity(NamedTuple):
@@ -81,14 +81,14 @@ class CarriedSums(NamedTuple):
         n = n + self.coriolis @ s.spin + self.load @ s.turn
         return n, f + cross(s.spin, self.momentum) * 2.0 + cross(s.turn, self.pull)
 
-    def row(self, w: Vector, v: Vector) -> Row:
+    def row(self, w: Vector, v: Vector) -> SensitivityAdjoint:
         """The force on a column (w; v) of H*, for whatever moves the link otherwise."""
         n, f = self.body.apply(w, v)
         spin = self.coriolis.T @ w + cross(self.momentum, v) * 2.0
-        return Row(n, f, spin, self.load.T @ w + cross(self.pull, v))
+        return SensitivityAdjoint(n, f, spin, self.load.T @ w + cross(self.pull, v))
 
 
-class Row(NamedTuple):
+class SensitivityAdjoint(NamedTuple):
     """A force as a function of how a link moves otherwise: the adjoint of :class:`Sensitivity`."""
 
     w: Vector
@@ -99,17 +99,17 @@ class Row(NamedTuple):
     def at(self, s: Sensitivity) -> Value:
         return dot(self.w, s.w) + dot(self.v, s.v) + dot(self.spin, s.spin) + dot(self.turn, s.turn)
 
-    def to_parent(self, place: Placed, drift: Vector) -> Row:
+    def to_parent(self, place: LinkPlacement, drift: Vector) -> SensitivityAdjoint:
         """The same for how the parent moves otherwise; ``drift``: see :func:`drift`."""
         pose = place.pose
         w, v = pose.force_to_parent(self.w, self.v)
-        return Row(w, v, pose.to_parent(self.spin) + cross(drift, v) * 2.0, pose.to_parent(self.turn))
+        return SensitivityAdjoint(w, v, pose.to_parent(self.spin) + cross(drift, v) * 2.0, pose.to_parent(self.turn))
 
 
 EMPTY = CarriedSums(Rigid(0.0, ZERO, NONE), NONE, ZERO, NONE, ZERO)
 
 
-def drift(link: Link, place: Placed, parent: Motion | None, qd: object) -> Vector:
+def drift(link: Link, place: LinkPlacement, parent: VelocityTerms | None, qd: object) -> Vector:
     """Velocity of the link's origin relative to its parent's, in the parent's axes."""
     if qd is None:
         return ZERO
@@ -117,7 +117,7 @@ def drift(link: Link, place: Placed, parent: Motion | None, qd: object) -> Vecto
     return own if parent is None else own + cross(parent.spin, place.pose.l)
 
 
-def of_body(inertia: Rigid | None, motion: Motion) -> CarriedSums:
+def of_body(inertia: Rigid | None, motion: VelocityTerms) -> CarriedSums:
     """A body that turns about its link's origin: u = omega x rho."""
     if inertia is None:
         return EMPTY
@@ -132,7 +132,7 @@ def under_load(moment_arm: Vector, force: Vector, torque: Vector) -> CarriedSums
     return EMPTY._replace(load=_lever(moment_arm, force) - skew(torque), pull=force)
 
 
-def to_parent(place: Placed, drifting: Vector, own: CarriedSums) -> CarriedSums:
+def to_parent(place: LinkPlacement, drifting: Vector, own: CarriedSums) -> CarriedSums:
     """Inertia, momentum and force of all that a link carries, about its parent's origin and in its axes."""
     pose, l = place.pose, place.pose.l
     body = pose.rigid_to_parent(own.body)
@@ -154,9 +154,9 @@ def _lever(arm: Vector, f: Vector) -> Matrix:
 
 def of_coordinates(
     link: Link,
-    place: Placed,
-    motion: Motion,
-    parent: Motion,
+    place: LinkPlacement,
+    motion: VelocityTerms,
+    parent: VelocityTerms,
     above: tuple[Vector, Vector],
     own: tuple[Vector, Vector],
     rates: Any,
@@ -203,7 +203,9 @@ def _entries_of(link: Link, entry: Any) -> list[Value]:
     return [entry(dof) for dof in link.dofs]
 
 
-def of_rates(link: Link, place: Placed, motion: Motion, parent: Motion, rates: Any) -> list[Sensitivity]:
+def of_rates(
+    link: Link, place: LinkPlacement, motion: VelocityTerms, parent: VelocityTerms, rates: Any
+) -> list[Sensitivity]:
     """Per unit of each rate of a link; ``rates``: qd by dof, or None."""
     spin_c = place.pose.to_child(parent.spin)
     both = spin_c + motion.spin
@@ -214,7 +216,7 @@ def of_rates(link: Link, place: Placed, motion: Motion, parent: Motion, rates: A
     return [s._replace(w=s.w + w, v=s.v + v) for s, (w, v) in zip(found, changes, strict=True)]
 
 
-def columns(link: Link, place: Placed) -> list[tuple[Vector, Vector]]:
+def columns(link: Link, place: LinkPlacement) -> list[tuple[Vector, Vector]]:
     """(w; v) of H* for each dof."""
     return [
         hinge_motion(link, place, lambda other, dof=dof: 1.0 if other == dof else 0.0)  # type: ignore[misc]

@@ -15,11 +15,11 @@ def tangent_gradient(trace: Trace, gradient: dict[tuple, Value]) -> list[tuple[t
     """Return (index, value) of the gradient along tangent coordinates, for the ``gradient`` by entries of q."""
     entries: list[tuple[tuple[int, ...], Value]] = []
     for link in trace.own_links:
-        if not link.leads:
+        if not link.is_leader:
             continue
         trace.label(link, "g")
         own = [gradient.get(("q", link.coordinate + i), 0.0) for i in range(link.hinge.coordinates)]
-        along = link.hinge.tangent(link, trace.places[id(link)], trace.vector("q"), own)
+        along = link.hinge.to_tangent(link, trace.places[id(link)], trace.vector("q"), own)
         entries += [((dof,), value) for dof, value in zip(link.dofs, along, strict=True)]
     return entries
 
@@ -30,6 +30,6 @@ def coordinate_directions(trace: Trace, rate: Entry) -> dict[int, Value]:
     for link in trace.links.leaders:
         trace.label(link, "g")
         rates = [rate(dof) for dof in link.dofs]
-        values = link.hinge.untangent(link, trace.places[id(link)], trace.vector("q"), rates)
+        values = link.hinge.from_tangent(link, trace.places[id(link)], trace.vector("q"), rates)
         found |= {link.coordinate + i: value for i, value in enumerate(values)}
     return found

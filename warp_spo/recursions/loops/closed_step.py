@@ -23,7 +23,7 @@ from ..coordinates import integrate_link
 from ..model.links import Link, place_link
 from ..step.step import Step, all_finite
 from . import clusters
-from .closures import Ratio, count_open_rows
+from .closures import CouplingConstraint, count_open_rows
 from .clusters import Cluster, Columns
 from .embedded import ClosedLoops, Embedding
 from .multipliers import combine_rows, loop_system
@@ -56,7 +56,7 @@ class ClosedStep(Step):
         self.margins += swept.margins
         return self.loops.outward_accelerations(swept, self.trace.base_acceleration)
 
-    def put_back(self, stores: list[Store]) -> list[Store]:
+    def project_state(self, stores: list[Store]) -> list[Store]:
         """Return the stores with q' and qd' projected onto the closures."""
         q, qd = ({s.index[0]: s.value for s in stores if s.array == array} for array in ("q_out", "out"))
         self.rates = [*qd.values()]
@@ -69,26 +69,30 @@ class ClosedStep(Step):
         return [s._replace(value=closed[s.array][s.index[0]]) if s.array in closed else s for s in stores]
 
     def _close(self, cluster: Cluster, q: Columns, qd: Columns) -> None:
-        count = 1 if all(isinstance(tie, Ratio) for _, tie in cluster.constraints) else NEWTON_STEPS
+        count = (
+            1
+            if all(isinstance(constraint, CouplingConstraint) for _, constraint in cluster.constraints)
+            else NEWTON_STEPS
+        )
         place = lambda: {id(link): place_link(link, q.__getitem__) for link in cluster.links}  # noqa: E731
         places = place()
-        tied = clusters.tie_rows(cluster, places, self.loops.embedding.rows, self.trace.epsilon)
-        self.margins_after += tied.space.margins
+        constrained = clusters.independent_rows(cluster, places, self.loops.embedding.rows, self.trace.epsilon)
+        self.margins_after += constrained.space.margins
         for _ in range(count):
-            step = tied.space.particular([-g for g in tied.errors(places, q.__getitem__)])
-            for link in (link for link in cluster.links if link.leads):
+            step = constrained.space.particular([-g for g in constrained.errors(places, q.__getitem__)])
+            for link in (link for link in cluster.links if link.is_leader):
                 new = integrate_link(link, q.__getitem__, lambda dof: step.get(dof, 0.0), 1.0)  # noqa: B023
                 q |= {link.coordinate + c: value for c, value in enumerate(new)}
             places = place()
-        rows = [row for _, tie in cluster.constraints for row in tie.jacobian(places)]
+        rows = [row for _, constraint in cluster.constraints for row in constraint.jacobian(places)]
         for _ in range(count):
-            rates = [total(x * qd[dof] for dof, x in rows[i].items()) for i in tied.numbers]
-            step = tied.space.particular([-rate for rate in rates])
+            rates = [total(x * qd[dof] for dof, x in rows[i].items()) for i in constrained.numbers]
+            step = constrained.space.particular([-rate for rate in rates])
             qd |= {dof: qd[dof] + change for dof, change in step.items()}
 
-    def _weightless(self, link: Link) -> bool:
+    def _is_massless(self, link: Link) -> bool:
         """Return whether no mass is on the link or further out; a link in a loop may carry what is beyond the loop."""
-        return id(link) not in self.loops.cluster_of and super()._weightless(link)
+        return id(link) not in self.loops.cluster_of and super()._is_massless(link)
 
     def _rank_loss(self) -> Value:
         least = RESOLVED * self.trace.epsilon
@@ -97,7 +101,7 @@ class ClosedStep(Step):
         )
         return before + select(all_finite(self.rates), after, 0.0)
 
-    def _opening(self) -> Value:
+    def _constraint_error(self) -> Value:
         q, qd = self.after
         places = {
             id(link): place_link(link, q.__getitem__) for cluster in self.loops.clusters for link in cluster.links
@@ -110,14 +114,14 @@ class MultiplierStep(Step):
 
     def system(self) -> list[Store]:
         """out, right, size: what the multipliers solve."""
-        self.trace.stiffened = self._with_resistance
+        self.trace.with_step_armature = self._with_resistance
         tau = self.trace.vector("tau")
         return loop_system(self.trace, lambda dof: tau(dof) + self.forces[dof])
 
     def _with_resistance(self, link: Link) -> Link:
         stiff = super()._with_resistance(link)
         for dof in link.dofs:
-            if any(law.bends for law in self.laws[dof]):
+            if any(law.has_bounds for law in self.laws[dof]):
                 label = self.trace.links.scene.dof_labels[dof]
                 what = f"a limit, friction or a bound on {label!r} with loops='multipliers'"
                 raise UnsupportedError("Dynamics.step", what, "use loops='embed'")

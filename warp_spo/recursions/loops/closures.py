@@ -19,7 +19,7 @@ from ...scene.parts import Coupling, Loop, in_plane
 from ...trace.scalars import Value, less, reciprocal
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, dot, total
 from .. import articulated
-from ..model.links import Link, Links, Placed, Seat
+from ..model.links import BodyPlacement, Link, LinkPlacement, Links
 from ..motion import hinge_motion, own_bias
 
 PARALLEL = 1e-6  # sine of the angle between two axes of a loop joint, below which they are one
@@ -27,7 +27,7 @@ OPEN = 1e-5  # [rad], or distance over arm; a larger error is an open closure. F
 SLOW = 1e-4  # [rad/s, m/s]; slower rates are not judged: the rates of a rigid truss are rounding alone
 
 
-class State(NamedTuple):
+class LinkState(NamedTuple):
     """Position and motion of a link: axes, origin; angular velocity, velocity of the origin; their rates."""
 
     axes: Matrix
@@ -38,10 +38,10 @@ class State(NamedTuple):
     acceleration: Vector
 
 
-REST = State(IDENTITY, ZERO, ZERO, ZERO, ZERO, ZERO)
+REST = LinkState(IDENTITY, ZERO, ZERO, ZERO, ZERO, ZERO)
 
 
-class Row(NamedTuple):
+class ConstraintRow(NamedTuple):
     """A direction (w; v) of the relative twist at the child anchor, and the rate of w; v turns with the parent."""
 
     w: Vector
@@ -50,7 +50,7 @@ class Row(NamedTuple):
 
 
 @dataclasses.dataclass
-class Ratio:
+class CouplingConstraint:
     """A coupling: qd[follower] = ratio qd[leader].
 
     Attributes:
@@ -92,7 +92,10 @@ class Closure:
     """
 
     def __init__(self, links: Links, loop: Loop):
-        self.inner, self.outer = links.seat(loop.parent, loop.parent_pose), links.seat(loop.child, loop.child_pose)
+        self.inner, self.outer = (
+            links.placement(loop.parent, loop.parent_pose),
+            links.placement(loop.child, loop.child_pose),
+        )
         inner, outer = _ancestors(self.inner.link), _ancestors(self.outer.link)
         while inner and outer and inner[0] is outer[0]:
             del inner[0], outer[0]
@@ -102,7 +105,7 @@ class Closure:
         self.rows = len(self.slides) + len(self.held) + len(self.crossed)
 
     # -- positions -------------------------------------------------------------------------------------------------
-    def error(self, places: dict[int, Placed], q: Any) -> list[Value]:
+    def error(self, places: dict[int, LinkPlacement], q: Any) -> list[Value]:
         """Return g: distances [m], and angles [rad] as twice the tangent of their half, zero only at zero."""
         inner, outer = self._anchors(places)
         back = inner.axes.T
@@ -121,7 +124,7 @@ class Closure:
         return values
 
     # -- rates -----------------------------------------------------------------------------------------------------
-    def jacobian(self, places: dict[int, Placed]) -> list[dict[int, Value]]:
+    def jacobian(self, places: dict[int, LinkPlacement]) -> list[dict[int, Value]]:
         """Return Y, each row by dof."""
         inner, outer = self._anchors(places)
         found: list[dict[int, Value]] = [{} for _ in range(self.rows)]
@@ -132,7 +135,7 @@ class Closure:
                 entries[dof] = entries[dof] + value if dof in entries else value
         return found
 
-    def sizes(self, places: dict[int, Placed]) -> list[Value]:
+    def sizes(self, places: dict[int, LinkPlacement]) -> list[Value]:
         """Return, for each row of Y, the sum of squares of the twists that it is a projection of."""
         _, outer = self._anchors(places)
         turning, sliding = 0.0, 0.0
@@ -140,7 +143,7 @@ class Closure:
             turning, sliding = turning + dot(w, w), sliding + dot(v, v)
         return [sliding] * len(self.slides) + [turning] * (self.rows - len(self.slides))
 
-    def _columns(self, places: dict[int, Placed], outer: State) -> Iterator[tuple[int, Vector, Vector]]:
+    def _columns(self, places: dict[int, LinkPlacement], outer: LinkState) -> Iterator[tuple[int, Vector, Vector]]:
         """Yield (dof, w, v): the relative twist at the child anchor per unit rate of each dof."""
         for path, sign in ((self.inner_path, -1.0), (self.outer_path, 1.0)):
             for link, state in zip(path, self._states(path, places), strict=True):
@@ -149,7 +152,7 @@ class Closure:
                     w, v = state.axes @ Vector(H[:3]), state.axes @ Vector(H[3:])
                     yield dof, w * sign, (v + cross(w, arm)) * sign
 
-    def acceleration(self, places: dict[int, Placed], qd: Any, qdd: Callable[[int], Value]) -> list[Value]:
+    def acceleration(self, places: dict[int, LinkPlacement], qd: Any, qdd: Callable[[int], Value]) -> list[Value]:
         """Return Y qdd + Y' qd; ``qd`` None is zero."""
         inner, outer = self._anchors(places, qd, qdd)
         w, v = outer.spin - inner.spin, outer.velocity - inner.velocity
@@ -161,25 +164,29 @@ class Closure:
         rows = self._rows(inner, outer)
         return [dot(row.w, rate) + dot(row.w_rate, w) + dot(row.v, a) for row in rows]
 
-    def _rows(self, inner: State, outer: State) -> list[Row]:
-        rows = [Row(ZERO, inner.axes @ e, ZERO) for e in self.slides]
+    def _rows(self, inner: LinkState, outer: LinkState) -> list[ConstraintRow]:
+        rows = [ConstraintRow(ZERO, inner.axes @ e, ZERO) for e in self.slides]
         for e in self.held:
             w = inner.axes @ e
-            rows.append(Row(w, ZERO, cross(inner.spin, w)))
+            rows.append(ConstraintRow(w, ZERO, cross(inner.spin, w)))
         for first, second in self.crossed:
             a, b = inner.axes @ first, outer.axes @ second
             rate = cross(cross(outer.spin, b), a) + cross(b, cross(inner.spin, a))
-            rows.append(Row(cross(b, a), ZERO, rate))
+            rows.append(ConstraintRow(cross(b, a), ZERO, rate))
         return rows
 
-    def _anchors(self, places: dict[int, Placed], qd: Any = None, qdd: Any = None) -> tuple[State, State]:
+    def _anchors(
+        self, places: dict[int, LinkPlacement], qd: Any = None, qdd: Any = None
+    ) -> tuple[LinkState, LinkState]:
         inner, outer = (
             _state_of_anchor(self._states(path, places, qd, qdd)[-1] if path else REST, anchor)
             for path, anchor in ((self.inner_path, self.inner), (self.outer_path, self.outer))
         )
         return inner, outer
 
-    def _states(self, path: list[Link], places: dict[int, Placed], qd: Any = None, qdd: Any = None) -> list[State]:
+    def _states(
+        self, path: list[Link], places: dict[int, LinkPlacement], qd: Any = None, qdd: Any = None
+    ) -> list[LinkState]:
         """Return the position and motion of each link of a path, relative to the common link."""
         found, state = [], REST
         for link in path:
@@ -188,7 +195,7 @@ class Closure:
         return found
 
 
-def _state_of_link(link: Link, place: Placed, over: State, qd: Any, qdd: Any) -> State:
+def _state_of_link(link: Link, place: LinkPlacement, over: LinkState, qd: Any, qdd: Any) -> LinkState:
     pose = place.pose
     axes, d = over.axes @ pose.rotation, over.axes @ pose.l
     spin, velocity, rate, acceleration = over.spin, over.velocity, over.spin_rate, over.acceleration
@@ -205,14 +212,14 @@ def _state_of_link(link: Link, place: Placed, over: State, qd: Any, qdd: Any) ->
     if qdd is not None:
         w, v = (axes @ part for part in hinge_motion(link, place, qdd))
         rate, acceleration = rate + w, acceleration + v
-    return State(axes, over.origin + d, spin, velocity, rate, acceleration)
+    return LinkState(axes, over.origin + d, spin, velocity, rate, acceleration)
 
 
-def _state_of_anchor(link: State, anchor: Seat) -> State:
+def _state_of_anchor(link: LinkState, anchor: BodyPlacement) -> LinkState:
     s = link.axes @ anchor.offset
     velocity = link.velocity + cross(link.spin, s)
     acceleration = link.acceleration + cross(link.spin_rate, s) + cross(link.spin, cross(link.spin, s))
-    return State(link.axes @ anchor.matrix, link.origin + s, link.spin, velocity, link.spin_rate, acceleration)
+    return LinkState(link.axes @ anchor.matrix, link.origin + s, link.spin, velocity, link.spin_rate, acceleration)
 
 
 def _ancestors(link: Link | None) -> list[Link]:
@@ -264,20 +271,20 @@ def _complement(axes: list[np.ndarray]) -> list[np.ndarray]:
     return [normal / np.linalg.norm(normal)]
 
 
-def closures(links: Links) -> list[Closure | Ratio]:
+def closures(links: Links) -> list[Closure | CouplingConstraint]:
     """Return the constraints of a scene: of its loop joints, then of its couplings."""
     scene = links.scene
     by_dof = {dof: link for link in links.leaders for dof in link.dofs}
-    found: list[Closure | Ratio] = [Closure(links, loop) for loop in scene.loops]
+    found: list[Closure | CouplingConstraint] = [Closure(links, loop) for loop in scene.loops]
     for coupling in scene.couplings:
         follower, leader = (by_dof[int(scene.qd_start[h])] for h in (coupling.hinge, coupling.reference))
-        found.append(_ratio(follower, leader, coupling))
+        found.append(_coupling_constraint(follower, leader, coupling))
     return found
 
 
 def count_open_rows(
-    constraints: list[Closure | Ratio],
-    places: dict[int, Placed],
+    constraints: list[Closure | CouplingConstraint],
+    places: dict[int, LinkPlacement],
     q: Callable[[int], Value],
     qd: Callable[[int], Value],
 ) -> Value:
@@ -293,9 +300,9 @@ def count_open_rows(
     return total(found)
 
 
-def _ratio(follower: Link, leader: Link, coupling: Coupling) -> Ratio:
+def _coupling_constraint(follower: Link, leader: Link, coupling: Coupling) -> CouplingConstraint:
     a, b = _ancestors(follower), _ancestors(leader)
     while len(a) > 1 and len(b) > 1 and a[0] is b[0]:
         del a[0], b[0]
     path = a + [link for link in b if all(link is not other for other in a)]
-    return Ratio(follower, leader, float(coupling.ratio), float(coupling.offset), path)
+    return CouplingConstraint(follower, leader, float(coupling.ratio), float(coupling.offset), path)

@@ -23,9 +23,9 @@ from ...trace.scalars import Value, absolute, guarded, reciprocal, sqrt
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from .. import articulated, newton_euler
 from ..articulated import NO_INERTIA
-from ..model.links import Link, Links, Placed
-from ..motion import Motion, hinge_entries
-from .closures import Closure, Ratio
+from ..model.links import Link, LinkPlacement, Links
+from ..motion import VelocityTerms, hinge_entries
+from .closures import Closure, CouplingConstraint
 from .nullspace import Basis, NullSpace
 
 Columns = dict[int, Value]  # by dof
@@ -43,11 +43,11 @@ class Cluster:
 
     links: list[Link]
     parent: Link | None
-    constraints: list[tuple[int, Closure | Ratio]]
+    constraints: list[tuple[int, Closure | CouplingConstraint]]
 
     @property
     def dofs(self) -> list[int]:
-        return [dof for link in self.links for dof in link.dofs if link.leads]
+        return [dof for link in self.links for dof in link.dofs if link.is_leader]
 
     @property
     def rows(self) -> list[int]:
@@ -55,7 +55,7 @@ class Cluster:
         return [first + i for first, constraint in self.constraints for i in range(constraint.rows)]
 
 
-def clusters(links: Links, constraints: list[Closure | Ratio]) -> list[Cluster]:
+def clusters(links: Links, constraints: list[Closure | CouplingConstraint]) -> list[Cluster]:
     """Return the clusters of a scene, in the order of their first links; links that share dofs go together."""
     owner = {id(link): id(link) for link in links.links}
 
@@ -68,8 +68,8 @@ def clusters(links: Links, constraints: list[Closure | Ratio]) -> list[Cluster]:
         for link in constraint.path[1:]:
             owner[find(id(link))] = find(id(constraint.path[0]))
     for link in links.links:
-        if link.group is not None:
-            owner[find(id(link))] = find(id(link.group.links[0]))
+        if link.shared_dofs is not None:
+            owner[find(id(link))] = find(id(link.shared_dofs.links[0]))
     found: dict[int, Cluster] = {}
     first = 0
     for constraint in constraints:
@@ -87,7 +87,7 @@ def clusters(links: Links, constraints: list[Closure | Ratio]) -> list[Cluster]:
 
 
 @dataclasses.dataclass
-class Tied:
+class ClusterConstraints:
     """A cluster at a configuration: its independent rows, factored."""
 
     cluster: Cluster
@@ -96,40 +96,40 @@ class Tied:
     numbers: list[int]  # of the rows, within the cluster
 
     def accelerations(
-        self, places: dict[int, Placed], qd: Any, qdd: Callable[[int], Value] = lambda dof: 0.0
+        self, places: dict[int, LinkPlacement], qd: Any, qdd: Callable[[int], Value] = lambda dof: 0.0
     ) -> list[Value]:
         """Return Y qdd + Y' qd."""
         values = [value for _, c in self.cluster.constraints for value in c.acceleration(places, qd, qdd)]
         return [values[i] for i in self.numbers]
 
-    def errors(self, places: dict[int, Placed], q: Any) -> list[Value]:
+    def errors(self, places: dict[int, LinkPlacement], q: Any) -> list[Value]:
         """Return g."""
         values = [value for _, c in self.cluster.constraints for value in c.error(places, q)]
         return [values[i] for i in self.numbers]
 
 
-def tie_rows(
-    cluster: Cluster, places: dict[int, Placed], kept: Any, epsilon: float, held: frozenset[int] = frozenset()
-) -> Tied:
-    """Return a cluster with the rows ``kept``, by number in the scene; dofs in ``held`` do not move."""
+def independent_rows(
+    cluster: Cluster, places: dict[int, LinkPlacement], kept: Any, epsilon: float, held: frozenset[int] = frozenset()
+) -> ClusterConstraints:
+    """Return a cluster with the rows ``pass_variables``, by number in the scene; dofs in ``held`` do not move."""
     rows = [row for _, constraint in cluster.constraints for row in constraint.jacobian(places)]
     sizes = [size for _, constraint in cluster.constraints for size in constraint.sizes(places)]
     numbers = [i for i, number in enumerate(cluster.rows) if number in kept]
     columns = [dof for dof in cluster.dofs if dof not in held]
     free = [{dof: x for dof, x in rows[i].items() if dof not in held} for i in numbers]
     space = NullSpace(free, [sizes[i] for i in numbers], columns, epsilon)
-    return Tied(cluster, space, [rows[i] for i in numbers], numbers)
+    return ClusterConstraints(cluster, space, [rows[i] for i in numbers], numbers)
 
 
 @dataclasses.dataclass
-class Factor:
+class ClusterFactor:
     """Results of eliminating a cluster.
 
     Attributes:
         X: columns by dof. L: unit lower triangular rows of D = L diag(d) L*; inverse: 1 / d.
         U: columns, (n; f) in the parent's axes.
         P: P+ in the parent's frame.
-        nothing: zero, or NaN where the closures lose a row.
+        lost_pivot: zero, or NaN where the closures lose a row.
     """
 
     X: list[Columns]
@@ -138,7 +138,7 @@ class Factor:
     inverse: list[Value]
     U: list[Vector]
     P: Articulated
-    nothing: Value
+    lost_pivot: Value
 
     def forward(self, b: list[Value]) -> list[Value]:
         """Return L^-1 b."""
@@ -158,11 +158,11 @@ class Factor:
 def factor(
     cluster: Cluster,
     space: NullSpace | Basis,
-    places: dict[int, Placed],
+    places: dict[int, LinkPlacement],
     own: dict[int, Articulated],
     epsilon: float,
     stiffened: Callable[[Link], Link],
-) -> Factor:
+) -> ClusterFactor:
     """Eliminate the rates of a cluster from the articulated inertias that its links carry, ``own``.
 
     ``stiffened``: returns a link with what a time step adds to its armature.
@@ -177,7 +177,7 @@ def factor(
             if id(child) in carried:
                 P = P + carried[id(child)]
         H_T = articulated.columns(link, places[key])
-        stiff, entries = stiffened(link) if link.leads else link, Entries()
+        stiff, entries = stiffened(link) if link.is_leader else link, Entries()
         for dof, armature, H in zip(link.dofs, stiff.armature, H_T, strict=True):
             n, f = P.apply(Vector(H[:3]), Vector(H[3:]))
             over: Link | None = link
@@ -188,7 +188,7 @@ def factor(
                 over = over.parent
             handed_on = Vector((*n, *f))
             F[dof] = F[dof] + handed_on if dof in F else handed_on
-        for (i, j), x in link.coupled.items():
+        for (i, j), x in link.coupling_inertia.items():
             for at in ((link.dofs[i], link.dofs[j]), (link.dofs[j], link.dofs[i])):
                 entries[at] = entries[at] + x
         for at, entry in entries.items():
@@ -202,7 +202,7 @@ def factor(
     root = {dof: sqrt(M[dof, dof]) for dof in cluster.dofs}
     sizes = [total(absolute(x) * root[dof] for dof, x in column.items()) for column in X]
     L, d, inverse = _pivots(D, [articulated.LEAST * epsilon * size * size for size in sizes])
-    done = Factor(X, L, d, inverse, U, handed, space.nothing)
+    done = ClusterFactor(X, L, d, inverse, U, handed, space.lost_pivot)
     if cluster.parent is not None and X:
         across = [done.forward([column[c] for column in U]) for c in range(6)]
         for k in range(len(X)):
@@ -232,8 +232,8 @@ def _pivots(D: list[list[Value]], least: list[Value]) -> tuple[list[list[Value]]
 
 def hinge_forces(
     cluster: Cluster,
-    places: dict[int, Placed],
-    motions: dict[int, Motion],
+    places: dict[int, LinkPlacement],
+    motions: dict[int, VelocityTerms],
     own: dict[int, Articulated],
     loads: dict[int, Vector],
     qdd: Any,
@@ -255,7 +255,7 @@ def hinge_forces(
             if id(child) in passed:
                 force = force + passed[id(child)]
         n, f = Vector(force[:3]), Vector(force[3:])
-        stiff = stiffened(link) if link.leads else link
+        stiff = stiffened(link) if link.is_leader else link
         for dof, value in zip(link.dofs, newton_euler.hinge_force(stiff, places[key], n, f, qdd), strict=True):
             tau[dof] = tau[dof] + value if dof in tau else value
         if link.parent is None:
@@ -268,12 +268,12 @@ def hinge_forces(
 
 
 def expand_cluster(
-    cluster: Cluster, done: Factor, rates: list[Value], k: Columns, above: tuple[Vector, Vector]
+    cluster: Cluster, done: ClusterFactor, rates: list[Value], k: Columns, above: tuple[Vector, Vector]
 ) -> Columns:
     """Return qdd by dof, for rates = D^-1 eps and the acceleration ``above`` of the parent."""
     alpha = (*above[0], *above[1])
     y = [a - b for a, b in zip(rates, done.solve([dot(column, alpha) for column in done.U]), strict=True)]
     columns = list(zip(done.X, y, strict=True))
     return {
-        dof: k.get(dof, 0.0) + done.nothing + total(X.get(dof, 0.0) * x for X, x in columns) for dof in cluster.dofs
+        dof: k.get(dof, 0.0) + done.lost_pivot + total(X.get(dof, 0.0) * x for X, x in columns) for dof in cluster.dofs
     }

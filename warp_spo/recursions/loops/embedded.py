@@ -17,8 +17,8 @@ from .. import articulated, newton_euler
 from ..articulated import HERE, NO_INERTIA
 from ..model.links import Link
 from . import clusters as aggregates
-from .closures import Closure, Ratio, closures
-from .clusters import Cluster, Columns, Tied
+from .closures import Closure, CouplingConstraint, closures
+from .clusters import Cluster, ClusterConstraints, Columns
 from .nullspace import Basis, NullSpace
 
 if TYPE_CHECKING:
@@ -35,9 +35,9 @@ class Embedding(NamedTuple):
 class Swept(NamedTuple):
     """Results of the inward sweep that the outward sweep reads, by link outside clusters and by cluster."""
 
-    links: dict[int, articulated.Factor]
+    links: dict[int, articulated.LinkFactor]
     link_rates: dict[int, list[Value]]
-    clusters: dict[int, aggregates.Factor]
+    clusters: dict[int, aggregates.ClusterFactor]
     cluster_rates: dict[int, list[Value]]
     demanded: dict[int, Columns]  # the qdd of a cluster at zero rates of its basis
     margins: list[Value]
@@ -59,7 +59,7 @@ class ClosedLoops:
         self.trace, self.embedding, self._alone = trace, embedding, list(alone)
 
     @functools.cached_property
-    def constraints(self) -> list[Closure | Ratio]:
+    def constraints(self) -> list[Closure | CouplingConstraint]:
         """The constraints of all loop joints, then of all couplings."""
         return closures(self.trace.links)
 
@@ -67,11 +67,11 @@ class ClosedLoops:
     def clusters(self) -> list[Cluster]:
         """The clusters, in the order of their first links."""
         found = aggregates.clusters(self.trace.links, self.constraints)
-        tied = {id(link) for cluster in found for link in cluster.links}
-        groups = [link for link in self.trace.links.links if link.group is not None and link.leads]
-        found += [Cluster(link.group.links, link.parent, []) for link in groups if id(link) not in tied]  # type: ignore[union-attr]
-        tied |= {id(link) for cluster in found for link in cluster.links}
-        return found + [Cluster([link], link.parent, []) for link in self._alone if id(link) not in tied]
+        constrained = {id(link) for cluster in found for link in cluster.links}
+        groups = [link for link in self.trace.links.links if link.shared_dofs is not None and link.is_leader]
+        found += [Cluster(link.shared_dofs.links, link.parent, []) for link in groups if id(link) not in constrained]  # type: ignore[union-attr]
+        constrained |= {id(link) for cluster in found for link in cluster.links}
+        return found + [Cluster([link], link.parent, []) for link in self._alone if id(link) not in constrained]
 
     @functools.cached_property
     def cluster_of(self) -> dict[int, Cluster]:
@@ -90,11 +90,11 @@ class ClosedLoops:
         """Name the scalars that follow after a cluster and a letter."""
         self.trace.graph.step = f"loops of {cluster.links[0].title}|{letter}"
 
-    def tie(self, cluster: Cluster, fixed: tuple[int, ...] = ()) -> Tied:
+    def constrain(self, cluster: Cluster, fixed: tuple[int, ...] = ()) -> ClusterConstraints:
         """Return the factored constraints of a cluster; ``fixed`` dofs do not move."""
         self.label(cluster, "y")
         rows = self.embedding.rows
-        return aggregates.tie_rows(cluster, self.trace.places, rows, self.trace.epsilon, frozenset(fixed))
+        return aggregates.independent_rows(cluster, self.trace.places, rows, self.trace.epsilon, frozenset(fixed))
 
     def sweep(
         self,
@@ -158,7 +158,7 @@ class ClosedLoops:
     ) -> tuple[Articulated, Vector]:
         """Eliminate a link that is in no cluster; return P+ and z+ in its parent's frame."""
         key, place, move = id(link), self.trace.places[id(link)], self.trace.motions[id(link)]
-        stiff = self.trace.stiffened(link)
+        stiff = self.trace.with_step_armature(link)
         swept.links[key] = done = articulated.factor(stiff, place, carried, through, self.trace.epsilon)
         self.trace.label(link, "z")
         right = [tau(dof) for dof in link.dofs]
@@ -166,13 +166,15 @@ class ClosedLoops:
         return done.in_parent, on_parent
 
     def _shortest(self, cluster: Cluster, swept: Swept, moves: bool) -> tuple[NullSpace, Columns]:
-        tied = self.tie(cluster)
-        swept.margins.extend(tied.space.margins)
-        return tied.space, self.demanded(tied) if moves else {}
+        constrained = self.constrain(cluster)
+        swept.margins.extend(constrained.space.margins)
+        return constrained.space, self.demanded(constrained) if moves else {}
 
-    def demanded(self, tied: Tied) -> Columns:
+    def demanded(self, constrained: ClusterConstraints) -> Columns:
         """Return the shortest qdd of a cluster that its velocities demand, by dof; fixed dofs are left out."""
-        return tied.space.particular([-a for a in tied.accelerations(self.trace.places, self.trace.vector("qd"))])
+        return constrained.space.particular(
+            [-a for a in constrained.accelerations(self.trace.places, self.trace.vector("qd"))]
+        )
 
     def _eliminate(
         self, cluster: Cluster, space: NullSpace | Basis, k: Columns, swept: Swept, own: dict, z: dict, tau: Callable
@@ -181,13 +183,19 @@ class ClosedLoops:
         swept.demanded[key] = k
         self.label(cluster, "D")
         swept.clusters[key] = done = aggregates.factor(
-            cluster, space, self.trace.places, own, self.trace.epsilon, self.trace.stiffened
+            cluster, space, self.trace.places, own, self.trace.epsilon, self.trace.with_step_armature
         )
         self.label(cluster, "z")
         t, force = aggregates.hinge_forces(
-            cluster, self.trace.places, self.trace.motions, own, z, lambda dof: k.get(dof, 0.0), self.trace.stiffened
+            cluster,
+            self.trace.places,
+            self.trace.motions,
+            own,
+            z,
+            lambda dof: k.get(dof, 0.0),
+            self.trace.with_step_armature,
         )
-        eps = [done.nothing + total(x * (tau(dof) - t[dof]) for dof, x in column.items()) for column in done.X]
+        eps = [done.lost_pivot + total(x * (tau(dof) - t[dof]) for dof, x in column.items()) for column in done.X]
         swept.cluster_rates[key] = rates = done.solve(eps)
         for column, rate in zip(done.U, rates, strict=True):
             force = force + column * rate

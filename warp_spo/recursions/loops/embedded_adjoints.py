@@ -22,7 +22,7 @@ from ...trace.spatial import ZERO, total
 from .. import newton_euler
 from ..derivatives import adjoints
 from ..derivatives.adjoints import TreeEquations, gradient_stores, rates_along
-from ..derivatives.power import Entry, Power, Ways
+from ..derivatives.power import Entry, Gradients, Power
 from .closed_step import ClosedStep
 from .clusters import Cluster, Columns
 from .embedded import ClosedLoops, Embedding
@@ -50,31 +50,33 @@ class ClosedEquations(TreeEquations):
         swept = self.loops.sweep(right, moves=False, loads=False)
         return self.loops.outward_accelerations(swept, (ZERO, ZERO))
 
-    def gradient(self, solved: Columns, qdd: Entry, tau: Entry, right: Entry) -> Ways:
+    def gradient(self, solved: Columns, qdd: Entry, tau: Entry, right: Entry) -> Gradients:
         """Return the gradient of the open tree's equations with the terms of the closures added."""
         trace = self.trace
         power = Power(trace, lambda dof: -solved[dof], qdd)
         for cluster in self.loops.clusters:
-            tied = self.loops.tie(cluster, self.fixed)
+            constrained = self.loops.constrain(cluster, self.fixed)
             self.loops.label(cluster, "m")
-            mu = tied.space.multipliers(lambda dof: power.forces[dof] - tau(dof))
-            nu = tied.space.multipliers(lambda dof: right(dof) + power.ways.get(("qdd", dof), 0.0))
+            mu = constrained.space.multipliers(lambda dof: power.forces[dof] - tau(dof))
+            nu = constrained.space.multipliers(lambda dof: right(dof) + power.gradients.get(("qdd", dof), 0.0))
             rates = {dof: cut(qdd(dof)) for dof in cluster.dofs}
             weights = {dof: cut(solved[dof]) for dof in cluster.dofs}
-            outputs = tied.accelerations(trace.places, None, weights.__getitem__)
-            outputs += tied.accelerations(trace.places, velocities(trace), rates.__getitem__)
+            outputs = constrained.accelerations(trace.places, None, weights.__getitem__)
+            outputs += constrained.accelerations(trace.places, velocities(trace), rates.__getitem__)
             stops = _distinct([*rates.values(), *weights.values()])
             leaves = [x for x in ordered(outputs, stops) if x.op == "input"]
             back = reverse(outputs, [*leaves, *stops], [*mu, *(-x for x in nu)])
-            found = [(x.args, way) for x, way in zip(leaves, back, strict=False)]
-            found += [(("qdd", dof), -(x * y)) for row, y in zip(tied.rows, nu, strict=True) for dof, x in row.items()]
-            for entry, way in found:
-                power.ways[entry] = power.ways.get(entry, 0.0) + way
-        return power.ways
+            found = [(x.args, gradient) for x, gradient in zip(leaves, back, strict=False)]
+            found += [
+                (("qdd", dof), -(x * y)) for row, y in zip(constrained.rows, nu, strict=True) for dof, x in row.items()
+            ]
+            for entry, gradient in found:
+                power.gradients[entry] = power.gradients.get(entry, 0.0) + gradient
+        return power.gradients
 
-    def put_back(self, stores: list[Store]) -> list[Store]:
+    def project_state(self, stores: list[Store]) -> list[Store]:
         """Return a state after a step, projected onto the closures."""
-        return ClosedStep(self.trace, self.loops.embedding).put_back(stores)
+        return ClosedStep(self.trace, self.loops.embedding).project_state(stores)
 
 
 def velocities(trace: Trace) -> Entry | None:
@@ -118,7 +120,7 @@ def forward_dynamics_jvp(trace: Trace, embedding: Embedding) -> list[Store]:
     rates, steps = _rates_at_fixed_accelerations(loops, (), still, trace.vector("tau"))
 
     def allowed(cluster: Cluster) -> tuple[NullSpace, Columns]:
-        return loops.tie(cluster).space, steps
+        return loops.constrain(cluster).space, steps
 
     swept = loops.sweep(lambda dof: push(dof) - rates[dof], moves=False, loads=False, allowed=allowed)
     return [Store("out", (dof,), x) for dof, x in loops.outward_accelerations(swept, (ZERO, ZERO)).items()]
@@ -149,20 +151,20 @@ def _rates_at_fixed_accelerations(
     trace = loops.trace
     forces = {item.index[0]: item.value for item in newton_euler.inverse_dynamics(trace, qdd=qdd.__getitem__)}
     left, still = dict(forces), [*qdd.values()]
-    tied, demands = [], []
+    constrained, demands = [], []
     for cluster in loops.clusters:
-        one = loops.tie(cluster, fixed)
+        one = loops.constrain(cluster, fixed)
         loops.label(cluster, "m")
         mu = [cut(x) for x in one.space.multipliers(lambda dof: forces[dof] - tau(dof))]
         for dof in cluster.dofs:
             left[dof] = left[dof] - total(row.get(dof, 0.0) * x for row, x in zip(one.rows, mu, strict=True))
         still += mu
         demands += one.accelerations(trace.places, velocities(trace), qdd.__getitem__)
-        tied.append(one)
+        constrained.append(one)
     pushed = iter(rates_along(trace, [*left.values(), *demands], _distinct(still)))
     rates = {dof: next(pushed) for dof in left}
     steps: Columns = {}
-    for one in tied:
+    for one in constrained:
         steps |= one.space.particular([-next(pushed) for _ in one.numbers])
     return rates, steps
 

@@ -18,7 +18,7 @@ from ..articulated import NO_INERTIA
 from ..articulated_sweeps import mirror, weighted_products
 from ..model.links import Link
 from ..motion import STILL
-from . import clusters as aggregates
+from . import clusters
 from .clusters import Cluster, Columns
 from .embedded import ClosedLoops, Embedding, Swept
 from .nullspace import Basis, NullSpace
@@ -32,13 +32,13 @@ NO_FORCE = Vector((*ZERO, *ZERO))
 
 def columns_of(loops: ClosedLoops, cluster: Cluster, moves: bool) -> tuple[dict[int, Columns], Columns, Value]:
     """Return X of a cluster by independent dof; its k; and zero, or NaN where the rows lose rank."""
-    tied = loops.tie(cluster, loops.embedding.dofs)
+    constrained = loops.constrain(cluster, loops.embedding.dofs)
     X = {
-        dof: {dof: 1.0, **tied.space.particular([-row.get(dof, 0.0) for row in tied.rows])}
+        dof: {dof: 1.0, **constrained.space.particular([-row.get(dof, 0.0) for row in constrained.rows])}
         for dof in cluster.dofs
         if dof in loops.embedding.dofs
     }
-    return X, loops.demanded(tied) if moves else {}, tied.space.nothing
+    return X, loops.demanded(constrained) if moves else {}, constrained.space.lost_pivot
 
 
 def columns_of_all(loops: ClosedLoops) -> dict[int, Columns]:
@@ -53,7 +53,7 @@ def demand(loops: ClosedLoops) -> Columns:
     """Return k by dof, zero of dofs that no loop ties; after the links are placed with their velocities."""
     found: Columns = dict.fromkeys(range(loops.trace.links.scene.dof_count), 0.0)
     for cluster in loops.clusters:
-        found |= loops.demanded(loops.tie(cluster, loops.embedding.dofs))
+        found |= loops.demanded(loops.constrain(cluster, loops.embedding.dofs))
     return found
 
 
@@ -128,12 +128,12 @@ def log_det_mass_matrix(trace: Trace, embedding: Embedding) -> list[Store]:
     loops = ClosedLoops(trace, embedding)
 
     def allowed(cluster: Cluster) -> tuple[Basis, Columns]:
-        X, k, nothing = columns_of(loops, cluster, moves=False)
-        return Basis(list(X.values()), nothing), k
+        X, k, lost_pivot = columns_of(loops, cluster, moves=False)
+        return Basis(list(X.values()), lost_pivot), k
 
     swept = loops.sweep(lambda dof: 0.0, moves=False, loads=False, allowed=allowed)
     D = [pivot.D for done in swept.links.values() for pivot in done.pivots]
-    D += [d + done.nothing for done in swept.clusters.values() for d in done.d]
+    D += [d + done.lost_pivot for done in swept.clusters.values() for d in done.d]
     return [Store("out", (), sum_of_logarithms(D))]
 
 
@@ -206,7 +206,7 @@ def _eliminate_cluster(
     done = swept.clusters[id(cluster)]
     loads = {id(other): NO_FORCE for other in cluster.links} | {id(link): force}
     own = dict.fromkeys(loads, NO_INERTIA)
-    t, force = aggregates.hinge_forces(cluster, loops.trace.places, loops.trace.motions, own, loads, lambda dof: 0.0)
+    t, force = clusters.hinge_forces(cluster, loops.trace.places, loops.trace.motions, own, loads, lambda dof: 0.0)
     eps = [total(x * (tau.get(dof, 0.0) - t[dof]) for dof, x in column.items()) for column in done.X]
     for column, rate in zip(done.U, done.solve(eps), strict=True):
         force = force + column * rate
@@ -217,8 +217,10 @@ def _products(loops: ClosedLoops, swept: Swept, columns: dict[int, dict[int, lis
     """out = Y* D Y, both triangles, of columns of Y = D^-1 [I - H psi K] ..."""
     D = {key: [pivot.D for pivot in done.pivots] for key, done in swept.links.items()}
     D |= {key: done.d for key, done in swept.clusters.items()}
-    nothing = [done.nothing for done in swept.links.values()] + [done.nothing for done in swept.clusters.values()]
-    return mirror(weighted_products(loops.trace, D, total(nothing), columns))
+    lost_pivot = [done.lost_pivot for done in swept.links.values()] + [
+        done.lost_pivot for done in swept.clusters.values()
+    ]
+    return mirror(weighted_products(loops.trace, D, total(lost_pivot), columns))
 
 
 def hybrid_dynamics(trace: Trace, embedding: Embedding, mask: tuple[bool, ...]) -> list[Store]:
@@ -233,13 +235,13 @@ def hybrid_dynamics(trace: Trace, embedding: Embedding, mask: tuple[bool, ...]) 
 
     def allowed(cluster: Cluster) -> tuple[NullSpace | Basis, Columns]:
         if not any(mask[dof] for dof in cluster.dofs):
-            tied = loops.tie(cluster)
-            return tied.space, loops.demanded(tied) if moves else {}
-        X, k, nothing = columns_of(loops, cluster, moves)
+            constrained = loops.constrain(cluster)
+            return constrained.space, loops.demanded(constrained) if moves else {}
+        X, k, lost_pivot = columns_of(loops, cluster, moves)
         for dof, column in X.items():
             for other, x in column.items() if mask[dof] else ():
                 k[other] = k.get(other, 0.0) + x * given(dof)
-        return Basis([column for dof, column in X.items() if not mask[dof]], nothing), k
+        return Basis([column for dof, column in X.items() if not mask[dof]], lost_pivot), k
 
     swept = loops.sweep(tau, moves, loads=True, allowed=allowed)
     qdd = loops.outward_accelerations(swept, trace.base_acceleration)

@@ -52,7 +52,7 @@ def _sizes(trace: Trace) -> list[Store]:
     return [Store("size", (i,), value) for i, value in enumerate(sizes)]
 
 
-def _rates_of_loads(trace: Trace, done: dict[int, articulated.Factor], tau: Columns) -> dict[int, list[Value]]:
+def _rates_of_loads(trace: Trace, done: dict[int, articulated.LinkFactor], tau: Columns) -> dict[int, list[Value]]:
     """Return D^-1 [I - H psi K] tau, by link."""
     rates: dict[int, list[Value]] = {}
     forces: dict[int, Vector] = {}

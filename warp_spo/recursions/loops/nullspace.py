@@ -32,10 +32,10 @@ class Reflection(NamedTuple):
 
 
 class Basis(NamedTuple):
-    """Chosen columns that the rows allow, by dof; ``nothing`` is NaN where the rows lose rank, otherwise zero."""
+    """Chosen columns that the rows allow, by dof; ``lost_pivot`` is NaN where the rows lose rank, otherwise zero."""
 
     basis: list[dict[int, Value]]
-    nothing: Value
+    lost_pivot: Value
 
 
 class NullSpace:
@@ -50,7 +50,7 @@ class NullSpace:
     Attributes:
         basis: orthonormal vectors that Y makes zero, by column.
         margins: of each row, the square of its remainder after the rows before it, over its size.
-        nothing: zero, or NaN where a row is zero_or_nan; the basis alone need not show that.
+        lost_pivot: zero, or NaN where a row is zero_or_nan; the basis alone need not show that.
     """
 
     def __init__(self, rows: list[dict[int, Value]], sizes: list[Value], columns: list[int], epsilon: float):
@@ -58,7 +58,7 @@ class NullSpace:
         self._steps: list[tuple[int, int, Value, Reflection | None]] = []  # row, column, 1 / L, reflection
         self._rows = [{c: x for c, x in row.items() if not _vanishes(x)} for row in rows]
         self.margins: list[Value] = []
-        self.nothing: Value = 0.0
+        self.lost_pivot: Value = 0.0
         waiting, live = list(range(len(rows))), list(columns)
         while waiting:
             row = min(waiting, key=lambda r: sum(c in self._rows[r] for c in live))
@@ -70,7 +70,7 @@ class NullSpace:
     def _reflect(self, row: int, left: dict, size: Value, waiting: list, live: list, epsilon: float) -> tuple:
         square = guarded(total(x * x for x in left.values()), (LEAST * epsilon) ** 2 * size)
         self.margins.append(square * reciprocal(size))
-        self.nothing = self.nothing + zero_or_nan(square)
+        self.lost_pivot = self.lost_pivot + zero_or_nan(square)
         if not left:
             pivot = live.pop(0)
             return row, pivot, square, None  # NaN: nothing is left of the row

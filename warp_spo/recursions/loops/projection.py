@@ -44,8 +44,8 @@ def project_position(trace: Trace, embedding: Embedding, fixed: tuple[int, ...] 
     place_links(trace)
     step: Columns = {}
     for cluster in loops.clusters:
-        tied = loops.tie(cluster, fixed)
-        step |= tied.space.particular([-g for g in tied.errors(trace.places, q)])
+        constrained = loops.constrain(cluster, fixed)
+        step |= constrained.space.particular([-g for g in constrained.errors(trace.places, q)])
     return move_all(trace, step)
 
 
@@ -61,7 +61,7 @@ def move_all(trace: Trace, step: Columns) -> list[Store]:
 
 def move(trace: Trace, link: Link, step: list[Value]) -> list[Value]:
     """Return the coordinates of a link after a small step of its dofs."""
-    return link.hinge.nudged(link, trace.places[id(link)], trace.vector("q"), step)
+    return link.hinge.perturb(link, trace.places[id(link)], trace.vector("q"), step)
 
 
 def project_velocity(trace: Trace, embedding: Embedding, fixed: tuple[int, ...] = ()) -> list[Store]:
@@ -70,6 +70,8 @@ def project_velocity(trace: Trace, embedding: Embedding, fixed: tuple[int, ...] 
     place_links(trace)
     step: Columns = {}
     for cluster in loops.clusters:
-        tied = loops.tie(cluster, fixed)
-        step |= tied.space.particular([-total(x * qd(dof) for dof, x in row.items()) for row in tied.rows])
+        constrained = loops.constrain(cluster, fixed)
+        step |= constrained.space.particular(
+            [-total(x * qd(dof) for dof, x in row.items()) for row in constrained.rows]
+        )
     return [Store("out", (dof,), qd(dof) + step.get(dof, 0.0)) for dof in range(trace.links.scene.dof_count)]

@@ -12,11 +12,11 @@ from ...trace.evaluation import evaluate
 from ..composite import mass_matrix
 from ..kinematics import jacobian
 from .links import Links
-from .scene_cache import remembered
+from .scene_cache import cached_by_scene
 from .tracing import Trace
 
 
-@remembered
+@cached_by_scene
 def masses(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Return the mass matrix and its pseudo-inverse [dof, dof].
 

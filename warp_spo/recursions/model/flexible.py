@@ -18,7 +18,7 @@ from ...hinges.deflection import Deflection
 from ...scene.flexible.modes import MASS_VALUES, mean_motion, slopes_of_child, slopes_of_frame
 from ...trace.scalars import is_constant
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
-from .link import Group, Link, Seat
+from .link import BodyPlacement, Link, SharedDofs
 from .rotations import still
 
 if TYPE_CHECKING:
@@ -47,34 +47,34 @@ class Flexible(NamedTuple):
 
 def deform(links: Links, node: int, dof: int, coordinate: int, armature: tuple) -> None:
     """Add the pieces of a body whose modal coordinates start at entry ``dof`` of qd and ``coordinate`` of q."""
-    scene, seat = links.scene, links.seats[node]
+    scene, placement = links.scene, links.placements[node]
     modes = scene.bodies[node].modes
     assert modes is not None
     R, p = links.nodes[node].anchor
-    axes = seat.matrix @ R.T
-    origin = seat.offset - axes @ p
+    axes = placement.matrix @ R.T
+    origin = placement.offset - axes @ p
     values = (scene.values[name][0, node] for name in MASS_VALUES)
     mean = mean_motion(scene.body_labels[node], modes, *values)
     dofs = tuple(range(dof, dof + modes.count))
     kind = Deflection(mean.slopes)
     at = origin + axes @ Vector(mean.center.tolist())
-    leader = Link(seat.link, kind, still(axes), at, None, dofs, coordinate, armature, node)
+    leader = Link(placement.link, kind, still(axes), at, None, dofs, coordinate, armature, node)
     leader.armature = tuple(a + b for a, b in zip(armature, np.diag(mean.armature).tolist(), strict=True))
     pairs = zip(*np.nonzero(np.triu(mean.armature, 1)), strict=True)
-    leader.group = Group([leader], {(int(i), int(j)): float(mean.armature[i, j]) for i, j in pairs})
+    leader.shared_dofs = SharedDofs([leader], {(int(i), int(j)): float(mean.armature[i, j]) for i, j in pairs})
     whole = links.rigid(node, np.eye(3), links.values["body_com"][node])
     rest = whole if modes.points is None else _less(whole, modes.points.inertia[:6, :6])
     follows = mean.rest_slopes.any()
-    own = links.flexible[node] = Flexible(seat.link, axes, origin, leader, NOTHING if follows else rest)
+    own = links.flexible[node] = Flexible(placement.link, axes, origin, leader, NOTHING if follows else rest)
     links.append(leader)
 
-    if seat.link is not None:
-        seat.link.add(Pose(None, axes, origin).rigid_to_parent(own.rest))
+    if placement.link is not None:
+        placement.link.add(Pose(None, axes, origin).rigid_to_parent(own.rest))
     if follows:
         center = Vector(mean.rest_center.tolist())
         follower = leader if modes.points is None else add_piece(links, own, Deflection(mean.rest_slopes), center)
         follower.add(Pose(None, None, -center).rigid_to_parent(rest))
-    leader.hold_up(links.values["body_gravcomp"].tolist()[node] * whole.mass, ZERO)
+    leader.compensate(links.values["body_gravcomp"].tolist()[node] * whole.mass, ZERO)
     if modes.points is not None:
         shapes, bends = modes.points.shapes, modes.points.stiffening
         for s, mass in enumerate(modes.points.mass.tolist()):
@@ -87,7 +87,7 @@ def deform(links: Links, node: int, dof: int, coordinate: int, armature: tuple) 
         hinge = scene.hinge_of[child]
         found = slopes_of_child(scene, int(child))
         anchor = Vector(links.poses["joint_X_p"][hinge][1].tolist())
-        links.ports[int(child)] = Seat(add_piece(links, own, Deflection(*found), anchor), IDENTITY, ZERO)
+        links.ports[int(child)] = BodyPlacement(add_piece(links, own, Deflection(*found), anchor), IDENTITY, ZERO)
 
 
 def attach(links: Links, frames: Iterable[tuple[int, Any]]) -> None:
@@ -97,7 +97,9 @@ def attach(links: Links, frames: Iterable[tuple[int, Any]]) -> None:
         if body in links.flexible and any(place) and (body, place) not in links.ports:
             own = links.flexible[body]
             found = slopes_of_frame(links.scene, body, place)
-            links.ports[body, place] = Seat(add_piece(links, own, Deflection(*found), Vector(place)), IDENTITY, ZERO)
+            links.ports[body, place] = BodyPlacement(
+                add_piece(links, own, Deflection(*found), Vector(place)), IDENTITY, ZERO
+            )
 
 
 def add_piece(links: Links, own: Flexible, kind: Deflection, position: Vector) -> Link:
@@ -112,10 +114,10 @@ def add_piece(links: Links, own: Flexible, kind: Deflection, position: Vector) -
         armature=no_armature,
         inertia=None,
         grouped=None,
-        lift=None,
+        gravity_compensation=None,
         children=[],
     )
-    leader.group.links.append(piece)  # type: ignore[union-attr]
+    leader.shared_dofs.links.append(piece)  # type: ignore[union-attr]
     links.append(piece)
     return piece
 

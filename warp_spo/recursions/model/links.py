@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...hinges.hinge_type import Placed as Placed
+from ...hinges.hinge_type import LinkPlacement as LinkPlacement
 from ...scene.actuators import ACTUATOR_VALUES, RANGES
 from ...scene.flexible.modes import Amplitudes
 from ...scene.parts import DOF_VALUES
@@ -26,14 +26,14 @@ from ...trace.scalars import Graph, Scalar, Value, is_constant, less, lost, sele
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric, total
 from . import flexible, rotors
 from .flexible import Flexible
-from .link import Group as Group
+from .link import BodyPlacement as BodyPlacement
 from .link import Link as Link
-from .link import Node as Node
-from .link import Seat as Seat
+from .link import NodeBody as NodeBody
+from .link import SharedDofs as SharedDofs
 from .rotations import aligned, folded, numbers, pose_of, still
 
 if TYPE_CHECKING:
-    from .shared_constants import Numbers
+    from .shared_constants import SharedConstants
 
 MOTION_VALUES = ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c", "joint_armature", "gravity")
 LINK_VALUES = (*MOTION_VALUES, "body_gravcomp")
@@ -55,26 +55,26 @@ class Links:
 
     Attributes:
         scene, variable: as given. graph: the trace's graph.
-        links: the links. seats, nodes: by body.
+        links: the links. placements, nodes: by body.
         gravity: Vector.
         turns_vary: some joint's anchor is turned by what is no constant.
         tables: the scalars that an :meth:`with_tables` copy reads, by name, in order.
         reverses: what takes gradients by the tables back to the values, see :mod:`warp_spo.execution.link_values`.
         values: one world's values; symbols where they vary. poses: of hinges' anchors, (rotation, position).
-        numbers: of the piece that a trace works on, see :mod:`.alike`; None: constants fold.
+        shared_constants: of the segment that a trace works on, see :mod:`.shared_constants`; None: constants fold.
         flexible: bodies with modes. ports: where children, by body, and frames, by (body, position), of them sit.
     """
 
     def __init__(self, scene: Scene, variable: tuple[str, ...] = ()):
         self.scene, self.variable, self.graph = scene, variable, Graph()
         self.links: list[Link] = []
-        self.seats: dict[int, Seat] = {}
-        self.nodes: dict[int, Node] = {}
+        self.placements: dict[int, BodyPlacement] = {}
+        self.nodes: dict[int, NodeBody] = {}
         self.tables: dict[str, dict[Scalar, int]] = {table: {} for table in TABLES}
         self.reverses: dict[Any, Any] = {}
-        self.numbers: Numbers | None = None
+        self.shared_constants: SharedConstants | None = None
         self.flexible: dict[int, Flexible] = {}
-        self.ports: dict[Any, Seat] = {}
+        self.ports: dict[Any, BodyPlacement] = {}
         self.values = {name: self._symbols(name, name in variable) for name in LINK_VALUES}
         self.gravity = Vector(self.values["gravity"].tolist())
         self.poses = {name: [pose_of(p) for p in self.values[name]] for name in ("joint_X_p", "joint_X_c")}
@@ -85,14 +85,14 @@ class Links:
         self._group()
 
     @property
-    def shared(self) -> bool:
+    def shares_dofs(self) -> bool:
         """Whether some links share dofs."""
-        return any(link.group is not None for link in self.links)
+        return any(link.shared_dofs is not None for link in self.links)
 
     @property
     def leaders(self) -> list[Link]:
         """The links at which dofs are accounted for, each dof at one."""
-        return [link for link in self.links if link.leads]
+        return [link for link in self.links if link.is_leader]
 
     def with_tables(self, copies: bool = False) -> Links:
         """Return a copy with a graph of its own, in which quantities that are not constant are entries of a table.
@@ -117,7 +117,7 @@ class Links:
                 parent=twin[link.parent],
                 inertia=value(link.inertia),
                 grouped=value(link.grouped),
-                lift=value(link.lift),
+                gravity_compensation=value(link.gravity_compensation),
                 matrix=value(link.matrix),
                 offset=value(link.offset),
                 com=value(link.com),
@@ -127,20 +127,20 @@ class Links:
             if link.parent is not None:
                 twin[link.parent].children.append(twin[link])
         other.links = [twin[link] for link in self.links]
-        groups = {id(link.group): link.group for link in self.links if link.group is not None}
+        groups = {id(link.shared_dofs): link.shared_dofs for link in self.links if link.shared_dofs is not None}
         for group in groups.values():
-            copied = Group([twin[link] for link in group.links], group.coupled)
+            copied = SharedDofs([twin[link] for link in group.links], group.coupling_inertia)
             for link in copied.links:
-                link.group = copied
+                link.shared_dofs = copied
         other.flexible = {
             node: Flexible(twin[own.link], value(own.axes), value(own.origin), twin[own.leader], apart(own.rest))
             for node, own in self.flexible.items()
         }
-        other.ports = {key: Seat(twin[s.link], *value(s[1:])) for key, s in self.ports.items()}
-        other.seats = {node: Seat(twin[s.link], *value(s[1:])) for node, s in self.seats.items()}
+        other.ports = {key: BodyPlacement(twin[s.link], *value(s[1:])) for key, s in self.ports.items()}
+        other.placements = {node: BodyPlacement(twin[s.link], *value(s[1:])) for node, s in self.placements.items()}
         other.gravity = value(self.gravity)
         other.nodes = {
-            node: Node(apart(own.tree), value(own.anchor), value(own.com), apart(own.rigid))
+            node: NodeBody(apart(own.tree), value(own.anchor), value(own.com), apart(own.rigid))
             for node, own in self.nodes.items()
         }
         return other
@@ -193,7 +193,7 @@ class Links:
         symbols.flat[vary] = [graph.input(name, int(entry)) for entry in vary]
         return symbols
 
-    def _node(self, node: int) -> Node:
+    def _node(self, node: int) -> NodeBody:
         scene, poses = self.scene, self.poses
         R, p = poses["joint_X_p"][scene.hinge_of[node]]
         parent = scene.tree.parent[node]
@@ -202,7 +202,7 @@ class Links:
             R, p = R_a.T @ R, R_a.T @ (p - p_a)
         R_c, p_c = poses["joint_X_c"][scene.hinge_of[node]]
         com = numbers(R_c.T @ (self.values["body_com"][node] - p_c))
-        return Node(
+        return NodeBody(
             (folded(R), Vector(p.tolist())),
             (folded(R_c), Vector(p_c.tolist())),
             Vector(com.tolist()),
@@ -233,28 +233,28 @@ class Links:
         entry = lambda i, j: 0.0 if gone[i] or gone[j] else own.inertia[i][j]  # noqa: E731
         return own._replace(inertia=Matrix.of([[entry(i, j) for j in range(3)] for i in range(3)]))
 
-    def seat(self, body: int, pose: np.ndarray) -> Seat:
+    def placement(self, body: int, pose: np.ndarray) -> BodyPlacement:
         """Where a frame of a body, or with -1 of the inertial frame, sits."""
         R, p = pose_of(pose)
         if body < 0:
-            return Seat(None, folded(R), Vector(p.tolist()))
+            return BodyPlacement(None, folded(R), Vector(p.tolist()))
         if (body, tuple(p.tolist())) in self.ports:
             port = self.ports[body, tuple(p.tolist())]
-            return Seat(port.link, port.matrix @ folded(R), port.offset)
-        seat, (R_body, p_body) = self.seats[body], self.nodes[body].anchor
-        axes = seat.matrix @ R_body.T
-        return Seat(seat.link, axes @ folded(R), seat.offset + axes @ (Vector(p.tolist()) - p_body))
+            return BodyPlacement(port.link, port.matrix @ folded(R), port.offset)
+        placement, (R_body, p_body) = self.placements[body], self.nodes[body].anchor
+        axes = placement.matrix @ R_body.T
+        return BodyPlacement(placement.link, axes @ folded(R), placement.offset + axes @ (Vector(p.tolist()) - p_body))
 
     def carrier(self, body: int) -> Link | None:
         """The link that the centre of mass of a body sits on."""
-        return self.flexible[body].leader if body in self.flexible else self.seats[body].link
+        return self.flexible[body].leader if body in self.flexible else self.placements[body].link
 
     def center(self, body: int) -> tuple[Link | None, Vector]:
         """The link that the centre of mass of a body sits on, and its place there; the mean one of a flexible body."""
         if body in self.flexible:
             return self.flexible[body].leader, ZERO
-        seat = self.seats[body]
-        return seat.link, seat.offset + seat.matrix @ self.nodes[body].com
+        placement = self.placements[body]
+        return placement.link, placement.offset + placement.matrix @ self.nodes[body].com
 
     def on_parent_node(self, link: Link) -> Link:
         """The first link of a hinge as it sits in the parent's node frame, instead of in the parent's link."""
@@ -274,13 +274,13 @@ class Links:
     def _place(self, node: int) -> None:
         scene = self.scene
         parent = scene.tree.parent[node]
-        seat = self.seats[parent] if parent >= 0 else Seat(None, IDENTITY, ZERO)
+        placement = self.placements[parent] if parent >= 0 else BodyPlacement(None, IDENTITY, ZERO)
         self.nodes[node] = body = self._node(node)
         index = scene.hinge_of[node]
         R, l = body.tree
         if node in self.ports:  # the parent's point that carries it, in the axes of the parent's body frame
-            seat, R, l = self.ports[node], folded(self.poses["joint_X_p"][index][0]), ZERO
-        matrix, offset, link = seat.matrix @ R, seat.offset + seat.matrix @ l, seat.link
+            placement, R, l = self.ports[node], folded(self.poses["joint_X_p"][index][0]), ZERO
+        matrix, offset, link = placement.matrix @ R, placement.offset + placement.matrix @ l, placement.link
         dof, coordinate = int(scene.qd_start[index]), int(scene.q_start[index])
         armatures = self.values["joint_armature"].tolist()
         rotor, anchor = scene.hinges[index].rotor, (matrix, offset)
@@ -306,8 +306,8 @@ class Links:
                 rotors.add(self, link, rotor, *anchor)
             matrix, offset = IDENTITY if align is None else align.T, -link.com if kind.at_com else ZERO
             dof, coordinate = dof + kind.dofs, coordinate + kind.coordinates
-        rest = Seat(link, matrix, offset)
-        self.seats[node] = rest
+        rest = BodyPlacement(link, matrix, offset)
+        self.placements[node] = rest
         if scene.bodies[node].modes is not None:
             flexible.deform(self, node, dof, coordinate, tuple(armatures[dof : dof + scene.bodies[node].modes.count]))
             return
@@ -316,7 +316,7 @@ class Links:
             at_com = rest.link.node == node and rest.link.hinge.at_com
             rest.link.add(self._without_rounding(node, inertia) if at_com else inertia)
             share = self.values["body_gravcomp"].tolist()[node]
-            rest.link.hold_up(share * body.rigid.mass, rest.offset + rest.matrix @ body.com)
+            rest.link.compensate(share * body.rigid.mass, rest.offset + rest.matrix @ body.com)
 
     def append(self, link: Link) -> None:
         """Add a link, after its parent."""
@@ -338,7 +338,7 @@ class Links:
                 continue
             if not all(map(is_constant, (*own.packed, *link.offset, *(x for row in link.matrix or () for x in row)))):
                 continue
-            parts = link.hinge.regrouped(own)
+            parts = link.hinge.split_inertia(own)
             if parts is None:
                 continue
             handed, kept = parts
@@ -352,9 +352,9 @@ class Links:
                 link.grouped, parent.grouped = kept, after
 
 
-def place_link(link: Link, q: Any) -> Placed:
+def place_link(link: Link, q: Any) -> LinkPlacement:
     """Return ``link`` where the coordinates put it; ``q(i)`` is entry i."""
-    return link.hinge.placed(link, q)
+    return link.hinge.transform(link, q)
 
 
 def _price(inertia: Rigid) -> int:

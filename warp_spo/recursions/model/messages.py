@@ -1,19 +1,35 @@
-"""Messages that the pieces of a robot send each other, and the place of each among those of an operation.
+"""Messages that the segments of a robot send each other, and the offset of each among those of an operation.
 
-Letters: inward P = phi P+ phi*, z and y = phi z+ or a force, f = a force, R = the composite inertia, B = how a sum
-changes with the parent's motion, G = how another one changes with what contact points know of the parent, O = with the
-ground's origin, U = the flow and momentum of what a link carries, L = its load and pull; outward a and b = alpha, Q =
-how a sum changes with P, and for Mass^-1 N = the rates of all pivots further in for each unit force on the last link,
-D = the piece's own pivots, V = its columns of Y, Y = the part of them that lies further in. From all to the first
-piece, when all is done: S = a status word, E = by how much the last pass of a step with contacts exceeds its laws. From
-all to all then: X = the coordinates and the rates of a piece after a step.
+A message has a letter. "Inward" goes to the parent, "outward" to all segments further out, "first" to the first segment
+when all others are done, "all" to all segments, after the state of the step is known.
+
+======  =========  ==================  ========================================================================
+letter  direction  values              meaning
+======  =========  ==================  ========================================================================
+P       inward     21                  articulated inertia phi P+ phi*
+z, y    inward     6                   articulated bias force phi z+, or another force on the parent
+f       inward     6                   force on the parent
+R       inward     10                  composite inertia
+B       inward     24                  how a sum changes with the parent's motion
+G       inward     36                  how another sum changes with what contact points know of the parent
+O       inward     3                   how it changes with the ground's origin
+U, L    inward     12                  flow and momentum of what a link carries; its load and pull
+a, b    outward    6                   acceleration alpha of the last link
+Q       outward    21                  how a sum changes with P
+N       outward    6 pivots            for Mass^-1: rates of all pivots further in per unit force on the last link
+D       outward    dofs                the segment's own pivots
+V, Y    outward    dofs times pivots   the segment's columns of Y = D^-1 [I - H psi K]; the part of them further in
+S       first      1                   status word
+E       first      4                   by how much the last pass of a step with contacts exceeds its laws
+X       all        coordinates + dofs  q and qd of a segment after a step
+======  =========  ==================  ========================================================================
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection
 
-from .segments import Piece, Pieces
+from .segments import Segment, Segments
 
 INWARD, OUTWARD = "sent", "returned"
 """The array that messages go through, by either name."""
@@ -24,19 +40,21 @@ NEEDS = {"U": "qd", "L": "body_f", "O": "ground_origin_later", "X": "poses_out"}
 """The array without which a message is zero, or nobody reads it, and is not sent, by letter."""
 
 
-def way(letter: str) -> str:
+def channel(letter: str) -> str:
     return OUTWARD if letter in OUTWARD_LETTERS else INWARD
 
 
-def size(letter: str, piece: Piece) -> int:
+def size(letter: str, segment: Segment) -> int:
     """Values of a message."""
     if letter in SIZES:
         return SIZES[letter]
     if letter == "X":
-        return piece.coordinates + piece.weight
-    further = sum(one.weight for one in piece.ancestors)
-    whole = further + piece.weight
-    return {"N": 6 * whole, "D": piece.weight, "V": whole * piece.weight, "Y": further * piece.weight}[letter]
+        return segment.coord_count + segment.dof_count
+    further = sum(one.dof_count for one in segment.ancestors)
+    whole = further + segment.dof_count
+    return {"N": 6 * whole, "D": segment.dof_count, "V": whole * segment.dof_count, "Y": further * segment.dof_count}[
+        letter
+    ]
 
 
 def needed(letters: str, inputs: Collection[str]) -> str:
@@ -44,31 +62,31 @@ def needed(letters: str, inputs: Collection[str]) -> str:
     return "".join(letter for letter in letters if letter not in NEEDS or NEEDS[letter] in inputs)
 
 
-def slots(letters: str, pieces: Pieces) -> tuple[dict[tuple[str, int], int], int]:
-    """Return where each message begins, by letter and piece, and the values of all messages together.
+def offsets(letters: str, segments: Segments) -> tuple[dict[tuple[str, int], int], int]:
+    """Return where each message begins, by letter and segment, and the values of all messages together.
 
     Long messages outward take the place of what the same tree sent inward and has read by then.
     """
     places: dict[tuple[str, int], int] = {}
     end = 0
     groups = ("P", letters[1:]) if "N" in letters else (letters,)
-    for root in (piece for piece in pieces.pieces if piece.parent is None):
-        tree = [piece for piece in pieces.pieces if root in (piece, *piece.ancestors)]
+    for root in (segment for segment in segments.all if segment.parent is None):
+        tree = [segment for segment in segments.all if root in (segment, *segment.ancestors)]
         start = end
         for group in groups:
             at = start
-            for piece in tree:
+            for segment in tree:
                 for letter in group:
-                    if _sends(letter, piece, tree):
-                        places[letter, piece.index] = at
-                        at += size(letter, piece)
+                    if _sends(letter, segment, tree):
+                        places[letter, segment.index] = at
+                        at += size(letter, segment)
             end = max(end, at)
     return places, end
 
 
-def _sends(letter: str, piece: Piece, tree: list[Piece]) -> bool:
+def _sends(letter: str, segment: Segment, tree: list[Segment]) -> bool:
     if letter in "SEX":
         return True
     if letter == "Y":
-        return any(other.looks_at(piece) for other in tree)
-    return bool(piece.children) if letter in OUTWARD_LETTERS else piece.parent is not None
+        return any(other.computes_shared_entries_with(segment) for other in tree)
+    return bool(segment.children) if letter in OUTWARD_LETTERS else segment.parent is not None

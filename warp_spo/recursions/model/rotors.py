@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...hinges.rotor_axis import Spin
+from ...hinges.rotor_axis import RotorAxis
 from ...scene.gears import Rotor
 from ...trace.spatial import ZERO, Matrix, Pose, Rigid, Vector, symmetric
-from .link import Group, Link
+from .link import Link, SharedDofs
 from .rotations import aligned, still
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def add(links: Links, driven: Link, rotor: Rotor, axes: Matrix, origin: Vector) 
     """Add the rotor of the hinge that moves ``driven``, whose parent anchor sits at ``origin`` in ``axes``."""
     link = dataclasses.replace(
         driven,
-        hinge=Spin(rotor.ratio),
+        hinge=RotorAxis(rotor.ratio),
         matrix=still(axes @ aligned(rotor.axis)),
         offset=origin + axes @ Vector(rotor.com.tolist()),
         align=None,
@@ -35,7 +35,7 @@ def add(links: Links, driven: Link, rotor: Rotor, axes: Matrix, origin: Vector) 
         com=ZERO,
         inertia=None,
         grouped=None,
-        lift=None,
+        gravity_compensation=None,
         children=[],
     )
     link.add(Rigid(0.0, ZERO, symmetric(0.0, 0.0, rotor.spin_inertia, 0.0, 0.0, 0.0)))
@@ -44,7 +44,7 @@ def add(links: Links, driven: Link, rotor: Rotor, axes: Matrix, origin: Vector) 
             link.add(across_axis(rotor))
         else:
             driven.parent.add(locked(rotor, axes, origin))
-    driven.group = link.group = Group([driven, link])
+    driven.shared_dofs = link.shared_dofs = SharedDofs([driven, link])
     links.append(link)
 
 
@@ -62,4 +62,4 @@ def locked(rotor: Rotor, axes: Matrix, origin: Vector) -> Rigid:
 
 def own_link(links: Links, node: int) -> Link | None:
     """Return the link of the rotor of a body's hinge, if it has one."""
-    return next((link for link in links.links if link.node == node and isinstance(link.hinge, Spin)), None)
+    return next((link for link in links.links if link.node == node and isinstance(link.hinge, RotorAxis)), None)

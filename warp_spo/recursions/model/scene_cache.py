@@ -1,4 +1,4 @@
-"""Results that depend on a scene alone, kept as long as the scene is: the pieces of a robot ask for them in turn."""
+"""Cache functions of a scene for as long as the scene exists. Each segment's trace needs the same results."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from ...scene.scene import Scene
 T = TypeVar("T")
 
 
-def remembered(evaluate: Callable[[Scene], T]) -> Callable[[Scene], T]:
-    """Return ``evaluate`` with a memory of its results, by scene."""
+def cached_by_scene(evaluate: Callable[[Scene], T]) -> Callable[[Scene], T]:
+    """Return ``evaluate`` with a cache of its results by scene."""
     known: weakref.WeakKeyDictionary[Scene, T] = weakref.WeakKeyDictionary()
 
     @functools.wraps(evaluate)

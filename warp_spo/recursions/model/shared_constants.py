@@ -1,8 +1,8 @@
-"""Constants in which pieces of one make differ: kept as numbers that do not fold, so that one text serves these pieces.
+"""Keep constants symbolic where segments of equal structure differ in them.
 
-A trace folds constants: an entry 0 of a rotation drops a term, -1 turns a sign, equal ones meet. Limbs that mirror each
-other then have texts of their own, and a kernel fetches the code of each. Where a constant does not fold, a limb with
-0 or 1 there computes a little more, and all limbs run the same code.
+Folding 0, 1 and -1 drops terms and signs. It gives each leg of a robot with mirrored legs code of its own, and together
+these overflow the instruction cache. If the constants in which segments differ are read from a table, all of these
+segments run one code, at a few more operations each.
 """
 
 from __future__ import annotations
@@ -15,39 +15,39 @@ from ...trace.spatial import IDENTITY, Matrix, Rigid, Vector
 
 if TYPE_CHECKING:
     from .link import Link
-    from .segments import Piece
+    from .segments import Segment
 
 OF_COORDINATES = ("joint_rest_q", "neutral_q")  # values with an entry for each coordinate
 OF_POINTS = ("contact_friction", "contact_stiffness", "contact_damping")
 
 
-class Numbers:
-    """The constants of a piece, each under a key that is the same in pieces of one make.
+class SharedConstants:
+    """The constants of a segment, each under a key that is the same in segments of equal structure.
 
     Args:
-        graph: of the trace. piece: the piece. points: numbers of the contact points that it works on, in order.
-        apart: keys of the constants that do not fold.
+        graph: of the trace. segment: the segment. points: numbers of the contact points that it works on, in order.
+        unfolded: keys of the constants that do not fold.
 
     Attributes:
-        found: the constants, by key.
+        by_key: the constants, by key.
     """
 
-    def __init__(self, graph: Graph, piece: Piece, points: Iterable[int] = (), apart: frozenset = frozenset()):
-        self.graph, self.apart = graph, apart
-        self.found: dict[tuple, float] = {}
-        self._dofs = {dof: at for at, dof in enumerate(piece.dofs)}
-        entries = [link.coordinate + c for link in piece.links for c in range(link.hinge.coordinates)]
+    def __init__(self, graph: Graph, segment: Segment, points: Iterable[int] = (), unfolded: frozenset = frozenset()):
+        self.graph, self.unfolded = graph, unfolded
+        self.by_key: dict[tuple, float] = {}
+        self._dofs = {dof: at for at, dof in enumerate(segment.dofs)}
+        entries = [link.coordinate + c for link in segment.links for c in range(link.hinge.coordinates)]
         self._coordinates = {entry: at for at, entry in enumerate(entries)}
         self._points = {point: at for at, point in enumerate(points)}
-        for at, link in enumerate(piece.links):
+        for at, link in enumerate(segment.links):
             self._take_link(at, link)
 
     def take(self, key: tuple, value: Value) -> Value:
         """Return a value; a constant that shall not fold as a scalar."""
         if not is_constant(value):
             return value
-        self.found[key] = float(value)
-        return number(self.graph, float(value), *key) if key in self.apart else value
+        self.by_key[key] = float(value)
+        return number(self.graph, float(value), *key) if key in self.unfolded else value
 
     def of_scene(self, name: str, index: int, value: Value) -> Value:
         """Return the same for an entry of one of the scene's values."""
@@ -60,7 +60,7 @@ class Numbers:
         return [self.take((name, self._points[point], at), value) for at, value in enumerate(values)]
 
     def of_body(self, at: int, name: str, values: Iterable[Value]) -> list[Value]:
-        """Return the same for numbers of the piece's ``at``-th body."""
+        """Return the same for numbers of the segment's ``at``-th body."""
         return [self.take((name, at, i), value) for i, value in enumerate(values)]
 
     def _take_link(self, at: int, link: Link) -> None:
@@ -79,25 +79,25 @@ class Numbers:
                 setattr(link, name, Rigid.unpacked(read(name, own.packed)))
 
 
-def differing(pieces: list[Piece], numbers: list[Numbers], texts: list[Any]) -> list[frozenset]:
-    """Return for each piece the keys of the constants that shall not fold; none where texts are equal already.
+def find_differing(segments: list[Segment], constants: list[SharedConstants], texts: list[Any]) -> list[frozenset]:
+    """Return for each segment the keys of the constants that shall not fold; none where texts are equal already.
 
-    Pieces are of one make if they move on the same piece and have the same hinges and keys.
+    Segments have equal structure if they move on the same segment and have the same hinges and keys.
 
     Args:
-        texts: what is equal for pieces that share their code.
+        texts: what is equal for segments that share their code.
     """
     made: dict[tuple, list[int]] = {}
-    for at, (piece, own) in enumerate(zip(pieces, numbers, strict=True)):
-        hinges = tuple(link.hinge.shape for link in piece.links)
-        above = -1 if piece.parent is None else piece.parent.index
-        made.setdefault((above, len(piece.children), hinges, frozenset(own.found)), []).append(at)
-    found = [frozenset[tuple]() for _ in pieces]
-    for alike in made.values():
-        if len({texts[at] for at in alike}) == 1:
+    for at, (segment, own) in enumerate(zip(segments, constants, strict=True)):
+        hinges = tuple(link.hinge.shape for link in segment.links)
+        above = -1 if segment.parent is None else segment.parent.index
+        made.setdefault((above, len(segment.children), hinges, frozenset(own.by_key)), []).append(at)
+    found = [frozenset[tuple]() for _ in segments]
+    for equal in made.values():
+        if len({texts[at] for at in equal}) == 1:
             continue
-        keys = numbers[alike[0]].found
-        apart = frozenset(key for key in keys if len({numbers[at].found[key] for at in alike}) > 1)
-        for at in alike:
-            found[at] = apart
+        keys = constants[equal[0]].by_key
+        unfolded = frozenset(key for key in keys if len({constants[at].by_key[key] for at in equal}) > 1)
+        for at in equal:
+            found[at] = unfolded
     return found

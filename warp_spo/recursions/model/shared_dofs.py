@@ -18,14 +18,14 @@ from typing import NamedTuple
 from ...trace.scalars import Value, guarded, reciprocal, select
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
 from ..articulated import LEAST, NO_INERTIA, columns
-from ..motion import Motion
+from ..motion import VelocityTerms
 from .link import Link
-from .links import Placed
+from .links import LinkPlacement
 
 NO_FORCE = Vector((*ZERO, *ZERO))
 
 
-class Pivot(NamedTuple):
+class SharedPivot(NamedTuple):
     """One eliminated dof of a group.
 
     Attributes:
@@ -40,23 +40,23 @@ class Pivot(NamedTuple):
 
 
 @dataclasses.dataclass
-class Factor:
+class SharedFactor:
     """Results of eliminating the dofs of a group.
 
     Attributes:
         links: of the group. columns: H* of each. carried: P of each, by id.
         pivots: in the order of elimination, the reverse of the dofs.
         P: that of the leader. whole: sum of phi P phi*. in_parent: P+ in the parent's frame.
-        nothing: zero; a lost pivot shows in the dofs of the group.
+        lost_pivot: zero; a lost pivot shows in the dofs of the group.
     """
 
     links: list[Link]
     columns: dict[int, list[Vector]]
     carried: dict[int, Articulated]
-    pivots: list[Pivot]
+    pivots: list[SharedPivot]
     whole: Articulated
     in_parent: Articulated
-    nothing: Value = 0.0
+    lost_pivot: Value = 0.0
 
     @property
     def P(self) -> Articulated:
@@ -65,24 +65,24 @@ class Factor:
 
 def factor(
     stiffened: Link,
-    places: dict[int, Placed],
+    places: dict[int, LinkPlacement],
     carried: dict[int, Articulated],
     epsilon: float,
     held: list[Value] | None = None,
-) -> Factor:
+) -> SharedFactor:
     """Eliminate the dofs of a group.
 
     Args:
         stiffened: its leader, with the armature that counts. carried: P by id of the link.
         epsilon: rounding of the dtype. held: 1 for each prescribed dof, which is not eliminated; else 0.
     """
-    group = stiffened.group
+    group = stiffened.shared_dofs
     assert group is not None
     links, n = group.links, len(stiffened.dofs)
     D: dict[tuple[int, int], Value] = {(i, i): a for i, a in enumerate(stiffened.armature)}
-    D |= {(j, i): x for (i, j), x in group.coupled.items()}
+    D |= {(j, i): x for (i, j), x in group.coupling_inertia.items()}
     U = [NO_FORCE] * n
-    found = Factor(links, {}, {id(link): carried[id(link)] for link in links}, [], NO_INERTIA, NO_INERTIA)
+    found = SharedFactor(links, {}, {id(link): carried[id(link)] for link in links}, [], NO_INERTIA, NO_INERTIA)
     for link in links:
         pose, P = places[id(link)].pose, carried[id(link)]
         found.columns[id(link)] = H = columns(link, places[id(link)])
@@ -106,7 +106,7 @@ def factor(
             U[i] = U[i] - U[at] * share
             for j in range(i + 1):
                 D[i, j] = D.get((i, j), 0.0) - share * row[j]
-        found.pivots.append(Pivot(U[at], pivot, inverse, row))
+        found.pivots.append(SharedPivot(U[at], pivot, inverse, row))
         if stiffened.parent is not None:
             P = P.less(U[at], U[at] * inverse)
     found.in_parent = P
@@ -114,9 +114,9 @@ def factor(
 
 
 def reduce(
-    done: Factor,
-    places: dict[int, Placed],
-    motions: dict[int, Motion],
+    done: SharedFactor,
+    places: dict[int, LinkPlacement],
+    motions: dict[int, VelocityTerms],
     forces: dict[int, Vector],
     tau: list[Value],
     given: tuple[list[Value], list[Value]] | None = None,
@@ -138,9 +138,9 @@ def reduce(
         eps = [e - dot(h, force) for e, h in zip(eps, done.columns[key], strict=True)]
         n, f = place.pose.force_to_parent(Vector(force[:3]), Vector(force[3:]))
         z = z + Vector((*n, *f))
-    rates, heads = [], []
+    rates, forces_at_rest = [], []
     for at, pivot in zip(reversed(range(len(eps))), done.pivots, strict=True):
-        heads.append(tau[at] - eps[at])
+        forces_at_rest.append(tau[at] - eps[at])
         rate = eps[at] * pivot.inverse
         if given is not None:
             rate = select(given[0][at], given[1][at], rate)
@@ -148,14 +148,14 @@ def reduce(
         for i, x in enumerate(pivot.row):
             eps[i] = eps[i] - x * rate
         z = z + pivot.U * rate
-    return rates, heads, z if done.links[0].parent is not None else NO_FORCE
+    return rates, forces_at_rest, z if done.links[0].parent is not None else NO_FORCE
 
 
-def expand(done: Factor, rates: list[Value], above: tuple[Vector, Vector]) -> tuple[list[Value], list[Value]]:
+def expand(done: SharedFactor, rates: list[Value], above: tuple[Vector, Vector]) -> tuple[list[Value], list[Value]]:
     """Return qdd of the group's dofs, and the forces that their rows of Mass feel, for the acceleration ``above``."""
-    alpha, qdd, felt = Vector((*above[0], *above[1])), list[Value](), list[Value]()
+    alpha, qdd, row_forces = Vector((*above[0], *above[1])), list[Value](), list[Value]()
     for pivot, rate in zip(done.pivots[::-1], rates[::-1], strict=True):
         along = dot(pivot.U, alpha) + total(x * a for x, a in zip(pivot.row, qdd, strict=True))
         qdd.append(rate - pivot.inverse * along)
-        felt.append(along + pivot.D * qdd[-1])
-    return qdd, felt
+        row_forces.append(along + pivot.D * qdd[-1])
+    return qdd, row_forces

@@ -1,4 +1,4 @@
-"""The state of one symbolic evaluation of a scene: its inputs, where links are placed, and messages between pieces.
+"""The state of one symbolic evaluation of a scene: its inputs, where links are placed, and messages between segments.
 
 The recursions are functions of a :class:`Trace` that return what they store. ``label`` names in the emitted code which
 link and which letter of the paper a value belongs to.
@@ -14,41 +14,46 @@ from ...trace.emission import Store
 from ...trace.scalars import Value
 from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Vector, cross
 from .. import motion, newton_euler
-from ..motion import STILL, Motion
+from ..motion import STILL, VelocityTerms
 from . import messages
-from .links import Link, Links, Placed, place_link
-from .segments import Piece
+from .links import Link, LinkPlacement, Links, place_link
+from .segments import Segment
 
 EPSILON = {"float32": 2.0**-23, "float64": 2.0**-52}
 
 
 class Trace:
-    """One evaluation of a scene, or of one piece of it: what is shared between the recursions on it.
+    """One evaluation of a scene, or of one segment of it: what is shared between the recursions on it.
 
     Args:
         links: the scene's links.
         dtype: "float32" or "float64"; pivots are compared with its rounding.
         inputs: names of the arrays that are read: "qd", "tau", "qdd", "body_f", "b"; an array that is not among them is
             zero and costs nothing.
-        piece: trace the work on this piece alone. The motion of its ancestors is computed anew; what it receives from
-            other pieces and sends to them goes through the array "sent" or "returned", from ``slot(letter, piece)`` on.
-        slot: first entry of a message, by letter and piece.
+        segment: trace the work on this segment alone. The motion of its ancestors is computed anew; what it receives
+            from other segments and sends to them goes through the array "sent" or "returned", from ``offset(letter,
+            segment)`` on.
+        offset: first entry of a message, by letter and segment.
 
     Attributes:
         places: by id of the link: its placement. motions: its velocity terms. axes: its axes in the inertial frame.
-        compensates: external wrenches hold up the bodies' ``gravcomp``, as forces of the hinges do.
-        stiffened: returns a link with what a time step adds to its armature.
-        news: messages that a piece sends apart from the others, because pieces of equal structure do not all send them.
-        rounds: what a piece stores after it has received all news, in turns of which many may be alike.
-        ahead: values that the passes of a loop share, formed once before the loop.
-        begin: stores before the passes of a loop, of the variables that they read.
-        dampers, pushes: by id of the link: what contacts add to its articulated inertia, and to the forces on it; of a
-            piece also for the link that it moves on.
-        laws: in turns of which many may be alike, stores before each pass: the laws of a dof at its guess.
-        checks: in such turns or in one, stores that check a pass; they read their inputs anew, which keeps no register.
-        instead: entries that take the place of those of an array, by its name.
-        team: of a piece, the pairs of bodies that native code couples between its sweeps. couples: what it stores for
-            each couple of bodies that touches, and the entry that says so; carried: values that both sweeps use.
+        compensates_gravity: external wrenches hold up the bodies' ``gravcomp``, as forces of the hinges do.
+        with_step_armature: returns a link with what a time step adds to its armature.
+        final_messages: messages that a segment sends apart from the others, because segments of equal structure do not
+            all send them.
+        final_stores: what a segment stores after it has received the final messages of all others. A list of groups;
+            groups with equal code are emitted as one loop.
+        pass_invariants: values that the passes of a loop share, formed once before the loop.
+        prologue: stores before the passes of a loop, of the variables that they read.
+        contact_inertia, contact_force: by id of the link: what contacts add to its articulated inertia, and to the
+            forces on it; of a segment also for the link that it moves on.
+        law_stores: stores before each pass: the laws of a dof at its guess. Groups as of ``final_stores``.
+        check_stores: stores that check a pass, in such groups or in one; they read their inputs anew, which keeps no
+            register.
+        substitutes: entries that take the place of those of an array, by its name.
+        team: of a segment, the pairs of bodies that native code couples between its sweeps. couples: what it stores for
+            each couple of bodies that touches, and the entry that says so; kept_between_sweeps: values that both sweeps
+            use.
     """
 
     def __init__(
@@ -56,37 +61,37 @@ class Trace:
         links: Links,
         dtype: str,
         inputs: tuple[str, ...],
-        piece: Piece | None = None,
-        slot: Callable[[str, Piece], int] | None = None,
+        segment: Segment | None = None,
+        offset: Callable[[str, Segment], int] | None = None,
     ):
         self.links, self.graph, self.epsilon, self.inputs = links, links.graph, EPSILON[dtype], inputs
-        self.piece, self.slot = piece, slot
-        self.news: list[Store] = []
-        self.rounds: list[list[Store]] = []
-        self.ahead: list[Value] = []
-        self.begin: list[Store] = []
-        self.dampers: dict[int, Articulated] = {}
-        self.pushes: dict[int, Vector] = {}
-        self.laws: list[list[Store]] = []
-        self.checks: list[list[Store]] = []
-        self.instead: dict[str, Callable[[int], Value]] = {}
+        self.segment, self.offset = segment, offset
+        self.final_messages: list[Store] = []
+        self.final_stores: list[list[Store]] = []
+        self.pass_invariants: list[Value] = []
+        self.prologue: list[Store] = []
+        self.contact_inertia: dict[int, Articulated] = {}
+        self.contact_force: dict[int, Vector] = {}
+        self.law_stores: list[list[Store]] = []
+        self.check_stores: list[list[Store]] = []
+        self.substitutes: dict[str, Callable[[int], Value]] = {}
         self.team: Any = None
         self.couples: list[tuple[int, list[Store]]] = []
-        self.carried: list[Value] = []
-        self._mail: dict[tuple[str, int], list[Value]] = {}  # messages between pieces of this trace
-        self.own = set(map(id, links.links if piece is None else piece.links))
+        self.kept_between_sweeps: list[Value] = []
+        self._mail: dict[tuple[str, int], list[Value]] = {}  # messages between segments of this trace
+        self.own = set(map(id, links.links if segment is None else segment.links))
         self.active = set(self.own)
-        above = None if piece is None else piece.links[0].parent
+        above = None if segment is None else segment.links[0].parent
         while above is not None:
             self.active.add(id(above))
             above = above.parent
-        self.places: dict[int, Placed] = {}
-        self.motions: dict[int, Motion] = {}
+        self.places: dict[int, LinkPlacement] = {}
+        self.motions: dict[int, VelocityTerms] = {}
         self.axes: dict[int, Matrix] = {}
-        self.compensates = False
-        self.stiffened: Callable[[Link], Link] = lambda link: link
+        self.compensates_gravity = False
+        self.with_step_armature: Callable[[Link], Link] = lambda link: link
         self.bodies: dict[int, list[int]] = {}  # by link: the bodies whose centre of mass is on it
-        for body in links.seats:
+        for body in links.placements:
             link = links.carrier(body)
             if link is not None:
                 self.bodies.setdefault(id(link), []).append(body)
@@ -94,8 +99,8 @@ class Trace:
     # -- inputs ----------------------------------------------------------------------------------------------------
     def vector(self, name: str) -> Callable[[int], Value]:
         """Return ``entry(i)`` of an array; zero if the array is not among the inputs."""
-        if name in self.instead:
-            return self.instead[name]
+        if name in self.substitutes:
+            return self.substitutes[name]
         if name not in self.inputs:
             return lambda i: 0.0
         return lambda i: self.graph.input(name, i)
@@ -103,7 +108,7 @@ class Trace:
     def at(self, state: Mapping[str, Callable[[int], Value]]) -> Trace:
         """Return a trace of the same links at another ``state``: functions of entries of "q" and "qd", no forces."""
         other = copy.copy(self)
-        other.inputs, other.instead, other.compensates = tuple(state), dict(state), False
+        other.inputs, other.substitutes, other.compensates_gravity = tuple(state), dict(state), False
         other.places, other.motions, other.axes = {}, {}, {}
         return other
 
@@ -119,21 +124,21 @@ class Trace:
         parent = None if link.parent is None else self.motions[id(link.parent)]
         qd = self.vector("qd") if moves else None
         self.motions[id(link)] = motion.link_motion(link, place, parent, qd) if moves else STILL
-        if "body_f" in self.inputs or self.compensates:
+        if "body_f" in self.inputs or self.compensates_gravity:
             R = IDENTITY if link.parent is None else self.axes[id(link.parent)]
             self.axes[id(link)] = R @ place.pose.rotation
 
     def compensate_gravity(self) -> bool:
         """Let external wrenches hold up the bodies' ``gravcomp`` from now on; return whether a body has any."""
-        self.compensates = any(link.lift is not None for link in self.links.links)
-        return self.compensates
+        self.compensates_gravity = any(link.gravity_compensation is not None for link in self.links.links)
+        return self.compensates_gravity
 
     def external_wrench(self, link: Link) -> Vector:
         """Return (n; f) of the external wrenches on the bodies of a link, in its frame."""
         n, f = ZERO, ZERO
-        if self.compensates and link.lift is not None:
+        if self.compensates_gravity and link.gravity_compensation is not None:
             up = -(self.axes[id(link)].T @ self.links.gravity)
-            n, f = cross(link.lift.moment, up), up * link.lift.mass
+            n, f = cross(link.gravity_compensation.moment, up), up * link.gravity_compensation.mass
         if "body_f" not in self.inputs:
             return Vector((*n, *f))
         acting = []
@@ -145,76 +150,78 @@ class Trace:
         return Vector((*n, *f))
 
     def _center(self, body: int) -> Vector:
-        """Return the centre of mass of a body of this piece in its link, with numbers that may be kept from folding."""
-        numbers, seat = self.links.numbers, self.links.seats[body]
-        if numbers is None or body in self.links.flexible:
+        """Return the centre of mass of a body of this segment in its link, with numbers that may be kept from
+        folding."""
+        constants, placement = self.links.shared_constants, self.links.placements[body]
+        if constants is None or body in self.links.flexible:
             return self.links.center(body)[1]
         at, com = self.own_bodies.index(body), self.links.nodes[body].com
-        rows = numbers.of_body(at, "seat", [x for row in seat.matrix for x in row])
-        turned = Matrix.of([rows[3 * i : 3 * i + 3] for i in range(3)]) @ Vector(numbers.of_body(at, "centre", com))
-        return Vector(numbers.of_body(at, "offset", seat.offset)) + turned
+        rows = constants.of_body(at, "seat", [x for row in placement.matrix for x in row])
+        turned = Matrix.of([rows[3 * i : 3 * i + 3] for i in range(3)]) @ Vector(constants.of_body(at, "centre", com))
+        return Vector(constants.of_body(at, "offset", placement.offset)) + turned
 
     @property
     def base_acceleration(self) -> tuple[Vector, Vector]:
         """Angular and linear acceleration of the inertial frame that stand for gravity."""
         return ZERO, -self.links.gravity
 
-    # -- pieces ----------------------------------------------------------------------------------------------------
+    # -- segments ----------------------------------------------------------------------------------------------------
     def traversal(self) -> Iterator[tuple[Link, bool]]:
-        """Yield (link, True) outward for this piece and its ancestors, (link, False) back for this piece's links."""
+        """Yield (link, True) outward for this segment and its ancestors, (link, False) back for this segment's
+        links."""
         for link, outward in self.links.traversal():
             if id(link) in self.active and (outward or id(link) in self.own):
                 yield link, outward
 
     @property
     def own_links(self) -> list[Link]:
-        """The links of this piece, parents first; all links where the whole tree is traced."""
+        """The links of this segment, parents first; all links where the whole tree is traced."""
         return [link for link in self.links.links if id(link) in self.own]
 
     @property
     def active_links(self) -> list[Link]:
-        """The links of this piece and those that it moves on, parents first."""
+        """The links of this segment and those that it moves on, parents first."""
         return [link for link in self.links.links if id(link) in self.active]
 
     @property
     def own_bodies(self) -> list[int]:
-        """The bodies on the links of this piece; bodies that do not move count as the first piece's."""
-        carriers = {body: seat.link for body, seat in self.links.seats.items()}
-        rest = self.piece is None or self.piece.index == 0
+        """The bodies on the links of this segment; bodies that do not move count as the first segment's."""
+        carriers = {body: placement.link for body, placement in self.links.placements.items()}
+        rest = self.segment is None or self.segment.index == 0
         return [body for body, link in carriers.items() if (rest if link is None else id(link) in self.own)]
 
-    def send(self, letter: str, piece: Piece, values: Iterable[Value]) -> list[Store]:
-        """Return the stores that send a message of ``piece``; a trace of the whole tree keeps the values instead."""
-        if self.piece is None:
-            self._mail[letter, piece.index] = list(values)
+    def send(self, letter: str, segment: Segment, values: Iterable[Value]) -> list[Store]:
+        """Return the stores that send a message of ``segment``; a trace of the whole tree keeps the values instead."""
+        if self.segment is None:
+            self._mail[letter, segment.index] = list(values)
             return []
-        assert self.slot is not None
-        first = self.slot(letter, piece)
-        return [Store(messages.way(letter), (first + i,), value) for i, value in enumerate(values)]
+        assert self.offset is not None
+        first = self.offset(letter, segment)
+        return [Store(messages.channel(letter), (first + i,), value) for i, value in enumerate(values)]
 
-    def receive(self, letter: str, piece: Piece) -> list[Value]:
-        """Return the message that ``piece`` sends."""
-        if self.piece is None:
-            return self._mail[letter, piece.index]
-        assert self.slot is not None
-        first = self.slot(letter, piece)
-        return [self.graph.input(messages.way(letter), first + i) for i in range(messages.size(letter, piece))]
+    def receive(self, letter: str, segment: Segment) -> list[Value]:
+        """Return the message that ``segment`` sends."""
+        if self.segment is None:
+            return self._mail[letter, segment.index]
+        assert self.offset is not None
+        first = self.offset(letter, segment)
+        return [self.graph.input(messages.channel(letter), first + i) for i in range(messages.size(letter, segment))]
 
     def from_children(self, link: Link, letter: str, known: dict[int, Any], build: Callable[[list], Any]) -> list[Any]:
-        """Return the results of a link's children: those ``known`` here, or built from messages of other pieces."""
-        if self.piece is None or id(link.children[0] if link.children else link) in self.own:
+        """Return the results of a link's children: those ``known`` here, or built from messages of other segments."""
+        if self.segment is None or id(link.children[0] if link.children else link) in self.own:
             return [known[id(child)] for child in link.children]
-        return [build(self.receive(letter, piece)) for piece in self.piece.children]
+        return [build(self.receive(letter, segment)) for segment in self.segment.children]
 
     def add_contacts(self, link: Link, P: Articulated, z: Vector) -> tuple[Articulated, Vector]:
-        """Return P+ and z+ for a link's parent, with what contacts add to the parent if another piece works on it."""
+        """Return P+ and z+ for a link's parent, with what contacts add to the parent if another segment works on it."""
         key = id(link.parent)
-        if key in self.own or key not in self.dampers:
+        if key in self.own or key not in self.contact_inertia:
             return P, z
-        return P + self.dampers[key], z - self.pushes[key]
+        return P + self.contact_inertia[key], z - self.contact_force[key]
 
     def send_to_parent(self, letter: str, link: Link, values: Iterable[Value]) -> list[Store]:
-        """Return the stores that send a result of a link to its parent, if another piece works on the parent."""
-        if self.piece is None or link is not self.piece.links[0] or link.parent is None:
+        """Return the stores that send a result of a link to its parent, if another segment works on the parent."""
+        if self.segment is None or link is not self.segment.links[0] or link.parent is None:
             return []
-        return self.send(letter, self.piece, values)
+        return self.send(letter, self.segment, values)

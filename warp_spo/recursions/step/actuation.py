@@ -4,7 +4,7 @@
 
 within the torque-speed curve where there is one; each hinge receives gear_i f. See :class:`warp_spo.Actuator`.
 
-In a time step these forces are laws of the dofs, see :mod:`.impedance`. On one hinge, bias1 and bias2 below zero are a
+In a time step these forces are laws of the dofs, see :mod:`.joint_laws`. On one hinge, bias1 and bias2 below zero are a
 spring and a damper, which are implicit like those of a drive, between bounds at the rate before the step. All else is
 linear in u about the state of the sweep: a motor along its torque-speed curve has the curve's slope for resistance; an
 actuator on several hinges has r = |gear_i| sum_j |gear_j| |df / dl'| on hinge i, a diagonal matrix that is not smaller
@@ -21,7 +21,7 @@ import numpy as np
 from ...trace.emission import Store
 from ...trace.scalars import Value, absolute, is_constant, less, select
 from ...trace.spatial import total
-from .joint_laws import Impedance, Law, is_number
+from .joint_laws import JointLaws, Law, is_number
 
 if TYPE_CHECKING:
     from ..model.links import Links
@@ -128,7 +128,7 @@ class Actuation:
 
 
 class ActuatorLaws:
-    """The forces of actuators as laws of the dofs for one step, see :mod:`.impedance`.
+    """The forces of actuators as laws of the dofs for one step, see :mod:`.joint_laws`.
 
     Args:
         trace: the evaluation; "ctrl" is among its inputs, "q" and "qd" are the state of its sweep.
@@ -137,8 +137,8 @@ class ActuatorLaws:
         ahead: entries of what the step adds to q of the sweep if u = 0.
     """
 
-    def __init__(self, trace: Trace, h: Value, qd: Entry, ahead: Entry):
-        self.h, self.qd, self.ahead, self.at = h, qd, ahead, trace.vector("qd")
+    def __init__(self, trace: Trace, h: Value, qd: Entry, drift: Entry):
+        self.h, self.qd, self.drift, self.at = h, qd, drift, trace.vector("qd")
         self.actuation = Actuation(trace.links, trace.vector("ctrl"), trace.vector("q"), self.at)
 
     def __call__(self, dof: int) -> list[Law]:
@@ -157,7 +157,7 @@ class ActuatorLaws:
         (stiff, damp), at = actuation.slopes(number), self.at(dof)
         k, d = below_zero(stiff), below_zero(damp)
         line = actuation.command(number) + gear * (stiff * actuation.q(coordinate) + damp * at)
-        line = line + gear * (k * self.ahead(dof) + d * (self.qd(dof) - at))
+        line = line + gear * (k * self.drift(dof) + d * (self.qd(dof) - at))
         low, high = actuation.bounds("actuator_force_range", number)
         curve = actuation.curve(number, gear * at)
         if curve[0] is not None:
@@ -187,11 +187,11 @@ class ActuatorLaws:
 
     def _implicit(self, number: int, one: Moved, gain: Entry) -> Value:
         """Return how far a coordinate moves in the step, where the force may depend on it implicitly; else 0."""
-        moved = self.ahead(one.dof) + self.h * gain(one.dof)
+        moved = self.drift(one.dof) + self.h * gain(one.dof)
         return select(less(self.actuation.slopes(number)[0], 0.0), moved, 0.0)
 
 
-def hinge_laws(trace: Trace, h: Value) -> Impedance:
+def build_joint_laws(trace: Trace, h: Value) -> JointLaws:
     """Return the laws of hinges and actuators at the state of the trace's sweep, over ``h`` seconds.
 
     The step starts from that state, unless "q_from" and "qd_from" are inputs. Actuators act where "ctrl" is an input.
@@ -199,16 +199,16 @@ def hinge_laws(trace: Trace, h: Value) -> Impedance:
     given, at = trace.inputs, trace.vector("qd")
     apart = "q_from" in given
     qd = trace.vector("qd_from") if apart else at
-    ahead = (lambda dof: h * (qd(dof) - at(dof))) if apart else (lambda dof: h * qd(dof))
-    return Impedance(
+    drift = (lambda dof: h * (qd(dof) - at(dof))) if apart else (lambda dof: h * qd(dof))
+    return JointLaws(
         trace.links,
         h,
         trace.vector("q"),
         qd,
-        ahead,
+        drift,
         trace.vector("target_q") if "target_q" in given else None,
         trace.vector("target_qd"),
-        ActuatorLaws(trace, h, qd, ahead) if "ctrl" in given else None,
+        ActuatorLaws(trace, h, qd, drift) if "ctrl" in given else None,
     )
 
 

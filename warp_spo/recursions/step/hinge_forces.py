@@ -8,8 +8,8 @@ from ...trace.emission import Store
 from ...trace.scalars import Value
 from ...trace.spatial import Vector, total
 from ..motion import hinge_entries
-from .actuation import hinge_laws
-from .joint_laws import Impedance
+from .actuation import build_joint_laws
+from .joint_laws import JointLaws
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace
@@ -20,24 +20,24 @@ def hinge_force(trace: Trace) -> list[Store]:
 
     Gravity compensation is a part of it.
     """
-    impedance = hinge_laws(trace, 0.0)
+    joint_laws = build_joint_laws(trace, 0.0)
     stores = []
     held = compensation(trace)
     for link in trace.links.leaders:
         trace.label(link, "f")
-        for dof, laws in zip(link.dofs, impedance.laws(link), strict=True):
+        for dof, laws in zip(link.dofs, joint_laws.laws(link), strict=True):
             stores.append(Store("out", (dof,), total(law.at(0.0) for law in laws) + held.get(dof, 0.0)))
     return stores
 
 
 def passive_force(trace: Trace) -> list[Store]:
     """out = -damping qd - stiffness (q - rest) + the forces that hold up the bodies' gravcomp"""
-    impedance = Impedance(trace.links, 0.0, trace.vector("q"), trace.vector("qd"))
+    joint_laws = JointLaws(trace.links, 0.0, trace.vector("q"), trace.vector("qd"))
     stores = []
     held = compensation(trace)
     for link in trace.links.leaders:
         trace.label(link, "f")
-        for dof, law in zip(link.dofs, impedance.passive(link), strict=True):
+        for dof, law in zip(link.dofs, joint_laws.passive(link), strict=True):
             stores.append(Store("out", (dof,), law.force + held.get(dof, 0.0)))
     return stores
 

@@ -24,7 +24,7 @@ from ...trace.scalars import Value, absolute, is_constant, less, reciprocal, sel
 from ...trace.spatial import total
 from ..model.effective_mass import masses
 from ..model.links import Link, Links
-from ..model.scene_cache import remembered
+from ..model.scene_cache import cached_by_scene
 
 CREEP = 1e-4  # rate [rad/s, m/s] below which dry friction is a damper; it saturates at this rate
 DEFAULT_BOUND = 1e6  # effort and velocity limits of this size and more are no limits; Newton's default
@@ -53,13 +53,13 @@ class Law(NamedTuple):
     symmetric: bool = False
 
     @property
-    def bends(self) -> bool:
+    def has_bounds(self) -> bool:
         return self.least is not None or self.most is not None
 
     def line(self, u: Value) -> Value:
         return self.force - self.resistance * u
 
-    def bounded(self, line: Value) -> Value:
+    def clip(self, line: Value) -> Value:
         if self.most is not None:
             line = select(less(self.most, line), self.most, line)
         if self.least is not None:
@@ -68,11 +68,11 @@ class Law(NamedTuple):
 
     def at(self, u: Value) -> Value:
         """Return f(u)."""
-        return self.scale * self.bounded(self.line(u))
+        return self.scale * self.clip(self.line(u))
 
     def piece(self, u: Value) -> Law:
         """Return the piece that is active at ``u``, as a law without bounds."""
-        if not self.bends:
+        if not self.has_bounds:
             return self
         line = self.line(u)
         force, resistance = self.force, self.resistance
@@ -84,24 +84,24 @@ class Law(NamedTuple):
             force, resistance = select(under, self.least, force), select(under, 0.0, resistance)
         return Law(self.scale * force, self.scale * resistance)
 
-    def missed(self, guess: Value, u: Value, epsilon: float) -> Value:
+    def is_mispredicted(self, guess: Value, u: Value, epsilon: float) -> Value:
         """Return non-zero where the piece at ``guess`` differs from the law at ``u`` by more than rounding."""
-        if not self.bends:
+        if not self.has_bounds:
             return 0.0
         one = self._replace(scale=1.0)
         piece = one.piece(guess)
         size = absolute(piece.force) + absolute(piece.resistance * u)
         return less(NOISE * epsilon * size, absolute(one.at(u) - piece.line(u)))
 
-    def holding(self, u: Value, epsilon: float) -> Value:
+    def active_resistance(self, u: Value, epsilon: float) -> Value:
         """Return the resistance at ``u``; within rounding of a bound, that of the unbounded piece."""
-        if not self.bends:
+        if not self.has_bounds:
             return self.resistance
         line, size = self.line(u), absolute(self.force) + absolute(self.resistance * u)
-        cut = less(NOISE * epsilon * size, absolute(self.bounded(line) - line))
+        cut = less(NOISE * epsilon * size, absolute(self.clip(line) - line))
         return select(cut, 0.0, self.scale * self.resistance)
 
-    def skipped(self, guess: Value, u: Value) -> Value:
+    def crosses_bounds(self, guess: Value, u: Value) -> Value:
         """Return non-zero where ``guess`` and ``u`` lie beyond opposite bounds."""
         if self.least is None or self.most is None:
             return 0.0
@@ -111,7 +111,7 @@ class Law(NamedTuple):
         return down + up
 
     @property
-    def middle(self) -> Value:
+    def root(self) -> Value:
         """The u at which the force is zero."""
         return self.force * reciprocal(self.resistance)
 
@@ -121,7 +121,7 @@ def add_laws(laws: list[Law]) -> Law:
     return Law(total(law.force for law in laws), total(law.resistance for law in laws))
 
 
-class Impedance:
+class JointLaws:
     """The laws of every dof of a scene for one step.
 
     Args:
@@ -139,13 +139,13 @@ class Impedance:
         h: Value,
         q: Callable[[int], Value],
         qd: Callable[[int], Value],
-        ahead: Callable[[int], Value] | None = None,
+        drift: Callable[[int], Value] | None = None,
         target_q: Callable[[int], Value] | None = None,
         target_qd: Callable[[int], Value] = lambda dof: 0.0,
         actuators: Callable[[int], list[Law]] | None = None,
     ):
         self.links, self.scene, self.h, self.q, self.qd = links, links.scene, h, q, qd
-        self.ahead = ahead or (lambda dof: h * qd(dof))
+        self.drift = drift or (lambda dof: h * qd(dof))
         self.target_q, self.target_qd = target_q or self._neutral, target_qd
         self.actuators = actuators or (lambda dof: [])
 
@@ -153,12 +153,12 @@ class Impedance:
         """Return all laws of each dof of a link; those without bounds come first, added up."""
         every = []
         for i, dof in enumerate(link.dofs):
-            straight = [*self._damper(dof), *self._spring(link, i, "joint_stiffness", self._rest)]
+            unbounded = [*self._damper(dof), *self._spring(link, i, "joint_stiffness", self._rest)]
             found = [*self._drive(link, i), *self._limits(link, i), *self._friction(dof)]
             found += self.actuators(dof)
-            found += self._rate_limit(dof, straight + found)
-            straight += [law for law in found if not law.bends]
-            every.append([add_laws(straight)] * bool(straight) + [law for law in found if law.bends])
+            found += self._rate_limit(dof, unbounded + found)
+            unbounded += [law for law in found if not law.has_bounds]
+            every.append([add_laws(unbounded)] * bool(unbounded) + [law for law in found if law.has_bounds])
         return every
 
     def passive(self, link: Link) -> list[Law]:
@@ -173,8 +173,8 @@ class Impedance:
         found = []
         for i, dof in enumerate(link.dofs):
             k = self.value("joint_stiffness", dof)
-            stretch = 0.0 if is_number(k, 0.0) else self._stretch(link, i, self._rest)
-            found.append(0.5 * k * (stretch * stretch))
+            displacement = 0.0 if is_number(k, 0.0) else self._displacement(link, i, self._rest)
+            found.append(0.5 * k * (displacement * displacement))
         return found
 
     # -- values ----------------------------------------------------------------------------------------------------
@@ -186,9 +186,9 @@ class Impedance:
         return self._constant(name, index, column[0])
 
     def _constant(self, name: str, index: int, value: float) -> Value:
-        """Return a constant; pieces of one make may keep it from folding, see :mod:`.alike`."""
-        numbers = self.links.numbers
-        return float(value) if numbers is None else numbers.of_scene(name, index, float(value))
+        """Return a constant; segments of one make may keep it from folding, see :mod:`.shared_constants`."""
+        constants = self.links.shared_constants
+        return float(value) if constants is None else constants.of_scene(name, index, float(value))
 
     def _bound(self, name: str, dof: int, none: float) -> Value | None:
         """Return a bound; None if it is ``none`` or larger in all worlds, and stays so."""
@@ -227,10 +227,10 @@ class Impedance:
         k = self.value(name, link.dofs[i])
         if is_number(k, 0.0):
             return []
-        stretch = self._stretch(link, i, rest)
-        return [Law(-k * (stretch + self.ahead(link.dofs[i])), self.h * k)]
+        displacement = self._displacement(link, i, rest)
+        return [Law(-k * (displacement + self.drift(link.dofs[i])), self.h * k)]
 
-    def _stretch(self, link: Link, i: int, rest: Callable[[int], Value]) -> Value:
+    def _displacement(self, link: Link, i: int, rest: Callable[[int], Value]) -> Value:
         """Return q - rest of one dof of a link; of a rotation, an entry of its rotation vector."""
         first = link.coordinate
         return link.hinge.displacement(i, lambda c: self.q(first + c), lambda c: rest(first + c))
@@ -268,7 +268,7 @@ class Impedance:
             depth = inward * (bound - self.q(link.coordinate + i))  # how far outside; positive there
             k, d = self.value("joint_limit_ke", dof), self.value("joint_limit_kd", dof)
             d = select(less(0.0, depth), d, 0.0)
-            force = k * (depth - inward * self.ahead(dof)) - d * (inward * self.qd(dof))
+            force = k * (depth - inward * self.drift(dof)) - d * (inward * self.qd(dof))
             least, most = (0.0, None) if inward > 0.0 else (None, 0.0)
             laws.append(Law(inward * force, self.h * k + d, least, most, 1.0, LIMIT, depth, k))
         return laws
@@ -297,7 +297,7 @@ def is_number(x: Value, number: float) -> bool:
     return is_constant(x) and x == number
 
 
-@remembered
+@cached_by_scene
 def neutral_inertias(scene: Scene) -> np.ndarray:
     """Return 1 / diagonal of Mass^-1 at the neutral configuration of world 0 [dof]; of Mass where it is singular."""
     mass, inverse = masses(scene)

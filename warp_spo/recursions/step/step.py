@@ -1,11 +1,11 @@
 """One time step of a scene, linearly implicit: (Mass + h R) qdd = tau - bias_force + F, and q moved along the new qd.
 
-R and F are resistance and force of the hinges' laws, see :mod:`.impedance`. Where laws have bounds, a pass solves with
+R and F are resistance and force of the hinges' laws, see :mod:`.joint_laws`. Where laws have bounds, a pass solves with
 the pieces at its guess of u = qd' - qd and checks whether these pieces were the right ones. Passes share one text, run
 in a loop until all were right: sweeps over the tree, or for few dofs the solution of a system formed before the loop.
 
-Pieces that work side by side keep the guesses of their own dofs and store the state after the last pass, when no other
-piece reads the state before the step any more.
+Segments that work side by side keep the guesses of their own dofs and store the state after the last pass, when no
+other segment reads the state before the step any more.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from ..articulated_sweeps import expand, reduce
 from ..coordinates import integrate_link
 from ..kinematics import body_states
 from ..model.links import Link
-from ..model.segments import Piece, Pieces
+from ..model.segments import Segment, Segments
 from ..model.tracing import Trace
-from .actuation import hinge_laws
+from .actuation import build_joint_laws
 from .joint_laws import Law, add_laws, is_number
 from .joint_space import JointSpace
 
 GUESS, GAIN, MISSED, PASS = "guess", "gain", "missed", "pass"
-"""Variables of the loop over passes, zero at first: guess of u, and u, by dof of a piece; number of wrong guesses. And
-the number of the pass, from zero."""
+"""Variables of the loop over passes, zero at first: guess of u, and u, by dof of a segment; number of wrong guesses.
+And the number of the pass, from zero."""
 LOOPED = (GUESS, GAIN, MISSED)
 FORCE, RESISTANCE = "force", "resistance"
-"""Of the laws of a piece's dofs at their guesses, where these are found in turns."""
-MOST_LAWS = (
-    12  # dofs of unlike pieces; beyond, laws take turns in loops, because their statements are fetched too slowly
-)
-SHORT = 10  # dofs; up to so many, passes solve a system that is formed once
-PATIENCE, TURNS = 8, 3  # passes after which a dof changes its guess in every third one only, one dof after the other
-FAINT = 1e-12  # resistance of a massless dof without active law, as a share of the resistances of its laws
+"""Of the laws of a segment's dofs at their guesses, where loops evaluate them."""
+# dofs of segments that differ; beyond, laws are evaluated in loops, because their statements are fetched too slowly
+MOST_LAWS = 12
+MOST_JOINT_SPACE_DOFS = 10  # dofs; up to so many, passes solve a system that is formed once
+FREE_PASSES, UPDATE_PERIOD = 8, 3
+"""After so many passes a dof changes its guess in every third pass only, one dof after the other."""
+MASSLESS_RESISTANCE = 1e-12  # share of its laws' resistances that a massless dof without active law gets
 
 
 class Step:
@@ -51,34 +51,34 @@ class Step:
     """
 
     def __init__(self, trace: Trace):
-        self.trace, self.links = trace, [link for link in trace.own_links if link.leads]
+        self.trace, self.links = trace, [link for link in trace.own_links if link.is_leader]
         trace.compensate_gravity()
         vector, given = trace.vector, trace.inputs
         self.h = trace.graph.input("dt", 0)
         apart = "q_from" in given
         self.q, self.qd = (vector("q_from"), vector("qd_from")) if apart else (vector("q"), vector("qd"))
-        self.impedance = hinge_laws(trace, self.h)
+        self.joint_laws = build_joint_laws(trace, self.h)
         self.laws: dict[int, list[Law]] = {}  # by dof
         self.forces: dict[int, Value] = {}
-        self.messages: list[Store] = []  # to other pieces
-        self._kept = {dof: at for at, dof in enumerate(trace.piece.dofs)} if trace.piece else {}
-        self._in_turns = trace.piece is not None and Pieces(trace.links).unlike > MOST_LAWS
-        if self._in_turns:
-            reciprocal(self.h)  # older than what turns compute alone
+        self.messages: list[Store] = []  # to other segments
+        self._pass_index = {dof: at for at, dof in enumerate(trace.segment.dofs)} if trace.segment else {}
+        self._laws_in_loops = trace.segment is not None and Segments(trace.links).distinct_dof_count > MOST_LAWS
+        if self._laws_in_loops:
+            reciprocal(self.h)  # before the loops, each of which would compute it
 
     def stores(self, qdd: bool, status: bool) -> list[Store]:
         """Return the stores out = qd', q_out = q'; with ``qdd`` qdd_out = (qd' - qd) / h, with ``status`` the status.
 
-        For a piece, the stores of one pass; stores after the last pass are the trace's ``news``.
+        For a segment, the stores of one pass; stores after the last pass are the trace's ``final_messages``.
         """
         trace = self.trace
-        trace.stiffened = self._with_resistance
+        trace.with_step_armature = self._with_resistance
         tau = trace.vector("tau")
         found = self._accelerations(lambda dof: tau(dof) + self.forces[dof])
         gains = {dof: self.h * value for dof, value in found.items()}
         looped = self._stores_of_pass(gains)
         if looped:
-            gains = self._solve({dof: self._kept_as(GAIN, dof) for dof in gains})
+            gains = self._solve({dof: self._pass_variable(GAIN, dof) for dof in gains})
         rates_after = {dof: self.qd(dof) + gain for dof, gain in gains.items()}
         stores: list[Store] = []
         for link in self.links:
@@ -88,19 +88,19 @@ class Step:
             stores += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(coordinates)]
             if qdd:
                 stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
-        stores = self.put_back(stores)
+        stores = self.project_state(stores)
         results = [item.value for item in stores]
-        if trace.piece is not None:
-            trace.news = stores + (self._words(trace.piece, results) if status else [])
+        if trace.segment is not None:
+            trace.final_messages = stores + (self._send_status(trace.segment, results) if status else [])
             return self.messages + looped
         if status:
             trace.graph.step = "status|s"
-            stores.append(Store("status", (), self._word(results, bool(looped))))
+            stores.append(Store("status", (), self._status_word(results, bool(looped))))
         return looped + stores
 
     def _accelerations(self, tau: Callable[[int], Value]) -> dict[int, Value]:
         """Return qdd by dof for ``tau``, with the resistances of the active pieces added to Mass."""
-        if self._is_short:
+        if self._uses_joint_space:
             return self._in_joint_space(tau)
         done, rates, sent = reduce(self.trace, tau, moves=True, loads=True)
         stores = sent + expand(self.trace, done, rates, self.trace.base_acceleration)
@@ -108,23 +108,23 @@ class Step:
         return {item.index[0]: item.value for item in stores if item.array == "out"}
 
     @property
-    def _is_short(self) -> bool:
+    def _uses_joint_space(self) -> bool:
         """Whether one thread makes several passes over few dofs."""
-        if self.trace.links.scene.dof_count > SHORT or self.trace.piece is not None:
+        if self.trace.links.scene.dof_count > MOST_JOINT_SPACE_DOFS or self.trace.segment is not None:
             return False
-        return any(law.bends for link in self.links for laws in self.impedance.laws(link) for law in laws)
+        return any(law.has_bounds for link in self.links for laws in self.joint_laws.laws(link) for law in laws)
 
     def _in_joint_space(self, tau: Callable[[int], Value]) -> dict[int, Value]:
         """Return the same from a system that is formed once for all passes."""
         system = JointSpace(self.trace)
         pieces: dict[int, Law] = {}
-        self.trace.ahead = [*system.mass.values(), *system.bias.values()]
+        self.trace.pass_invariants = [*system.mass.values(), *system.bias.values()]
         for link in self.links:
             self.trace.label(link, "r")
-            pieces.update(zip(link.dofs, self._pieces(link), strict=True))
+            pieces.update(zip(link.dofs, self._active_pieces(link), strict=True))
         return dict(enumerate(system.solve(lambda dof: self.h * pieces[dof].resistance, tau)))
 
-    def put_back(self, stores: list[Store]) -> list[Store]:
+    def project_state(self, stores: list[Store]) -> list[Store]:
         """Return the stores with the state after the step projected onto its constraints."""
         return stores
 
@@ -132,161 +132,171 @@ class Step:
         """Return non-zero where constraints lose rank."""
         return 0.0
 
-    def _opening(self) -> Value:
+    def _constraint_error(self) -> Value:
         """Return non-zero where constraints do not hold after the step."""
         return 0.0
 
     def _with_resistance(self, link: Link) -> Link:
-        pieces = zip(link.armature, self._pieces(link), strict=True)
+        pieces = zip(link.armature, self._active_pieces(link), strict=True)
         return dataclasses.replace(link, armature=tuple(a + self.h * piece.resistance for a, piece in pieces))
 
-    def _pieces(self, link: Link) -> list[Law]:
+    def _active_pieces(self, link: Link) -> list[Law]:
         """Return the active pieces of each dof, added up; a massless dof without one gets a faint resistance."""
-        self.laws |= dict(zip(link.dofs, self.impedance.laws(link), strict=True))
+        self.laws |= dict(zip(link.dofs, self.joint_laws.laws(link), strict=True))
         pieces = [add_laws([law.piece(self._guess(dof)) for law in self.laws[dof]]) for dof in link.dofs]
-        if self._weightless(link):
-            faint = FAINT * total(law.scale * law.resistance for law in self.laws[link.dofs[0]])
+        if self._is_massless(link):
+            placeholder = MASSLESS_RESISTANCE * total(law.scale * law.resistance for law in self.laws[link.dofs[0]])
             held = pieces[0].resistance
-            pieces = [pieces[0]._replace(resistance=select(less(0.0, held), held, faint))]
-        if self._in_turns:
-            pieces = [self._in_turn(dof, piece) for dof, piece in zip(link.dofs, pieces, strict=True)]
+            pieces = [pieces[0]._replace(resistance=select(less(0.0, held), held, placeholder))]
+        if self._laws_in_loops:
+            pieces = [self._law_in_loop(dof, piece) for dof, piece in zip(link.dofs, pieces, strict=True)]
         self.forces |= {dof: piece.force for dof, piece in zip(link.dofs, pieces, strict=True)}
         return pieces
 
-    def _in_turn(self, dof: int, piece: Law) -> Law:
-        """Return the active piece of a dof as it is read in a pass: found in a turn before the pass, if laws bend."""
-        if not any(law.bends for law in self.laws[dof]):
+    def _law_in_loop(self, dof: int, piece: Law) -> Law:
+        """Return the active piece of a dof as it is read in a pass: a loop finds it before, if laws have bounds."""
+        if not any(law.has_bounds for law in self.laws[dof]):
             return piece
-        at = (self._kept[dof],)
-        self.trace.laws.append(_turn([Store(FORCE, at, piece.force), Store(RESISTANCE, at, piece.resistance)]))
-        return Law(self._kept_as(FORCE, dof), self._kept_as(RESISTANCE, dof))
+        at = (self._pass_index[dof],)
+        self.trace.law_stores.append(_isolate([Store(FORCE, at, piece.force), Store(RESISTANCE, at, piece.resistance)]))
+        return Law(self._pass_variable(FORCE, dof), self._pass_variable(RESISTANCE, dof))
 
-    def _weightless(self, link: Link) -> bool:
+    def _is_massless(self, link: Link) -> bool:
         """Whether the link's one dof carries no mass and has a law with bounds, so that forces alone move it."""
-        bare = len(link.dofs) == 1 and link.group is None and is_number(link.armature[0], 0.0) and carries_nothing(link)
-        return bare and any(law.bends for law in self.laws[link.dofs[0]])
+        bare = (
+            len(link.dofs) == 1
+            and link.shared_dofs is None
+            and is_number(link.armature[0], 0.0)
+            and is_massless_subtree(link)
+        )
+        return bare and any(law.has_bounds for law in self.laws[link.dofs[0]])
 
     def _solve(self, gains: dict[int, Value]) -> dict[int, Value]:
         """Return u by dof; NaN of a massless dof that no law resists."""
         for link in self.links:
-            if self._weightless(link):
+            if self._is_massless(link):
                 (dof,) = link.dofs
-                held = total(law.holding(gains[dof], self.trace.epsilon) for law in self.laws[dof])
+                held = total(law.active_resistance(gains[dof], self.trace.epsilon) for law in self.laws[dof])
                 gains[dof] = select(less(0.0, held), gains[dof], math.nan)
         return gains
 
     def _guess(self, dof: int) -> Value:
         """Return the guess of u of a dof: u of the pass before, unless a law asked for another value.
 
-        A piece keeps its guess apart: it computes u anew in every pass, and until then its registers are free.
+        A segment keeps its guess apart: it computes u anew in every pass, and until then its registers are free.
         """
         apart = any(law.least is not None and law.most is not None for law in self.laws[dof])
-        apart = apart or self.trace.piece is not None
-        return self._kept_as(GUESS if apart else GAIN, dof)
+        apart = apart or self.trace.segment is not None
+        return self._pass_variable(GUESS if apart else GAIN, dof)
 
-    def _kept_as(self, name: str, dof: int) -> Value:
-        return self.trace.graph.input(name, self._kept.get(dof, dof))
+    def _pass_variable(self, name: str, dof: int) -> Value:
+        return self.trace.graph.input(name, self._pass_index.get(dof, dof))
 
     def _stores_of_pass(self, gains: dict[int, Value]) -> list[Store]:
         """Return the stores at the end of a pass; none for a whole tree without bounded laws.
 
-        A piece has few registers left in its pass, so it checks its guesses afterwards with inputs that it reads anew.
+        A segment has few registers left in its pass, so it checks its guesses afterwards with inputs that it reads
+        anew.
         """
-        bends = any(law.bends for laws in self.laws.values() for law in laws)
-        if not bends and self.trace.piece is None:
+        has_bounds = any(law.has_bounds for laws in self.laws.values() for law in laws)
+        if not has_bounds and self.trace.segment is None:
             return []
         stores, missed, found = [], [], []
         turns: list[list[Store]] = []
         for link in self.links:
             self.trace.label(link, "u")
             for dof in link.dofs:
-                gain, laws, at = gains[dof], self.laws[dof], self._kept.get(dof, dof)
+                gain, laws, at = gains[dof], self.laws[dof], self._pass_index.get(dof, dof)
                 found.append(Store(GAIN, (at,), gain))
-                if self.trace.piece is None:
+                if self.trace.segment is None:
                     stores.append(found[-1])
                 else:
-                    gain = self._kept_as(GAIN, dof)
-                if not any(law.bends for law in laws):
+                    gain = self._pass_variable(GAIN, dof)
+                if not any(law.has_bounds for law in laws):
                     continue
                 guess = self._guess(dof)
-                wrong = [law.missed(guess, gain, self.trace.epsilon) for law in laws]
+                wrong = [law.is_mispredicted(guess, gain, self.trace.epsilon) for law in laws]
                 missed += wrong
                 turns.append([Store(MISSED, (0,), total(wrong))])
                 if guess.args[0] == GUESS:
                     after = gain
                     for law in laws:
-                        after = select(law.skipped(guess, gain), law.middle, after)
-                    stores.append(Store(GUESS, (at,), select(self._waits(at), guess, after)))
+                        after = select(law.crosses_bounds(guess, gain), law.root, after)
+                    stores.append(Store(GUESS, (at,), select(self._holds_guess(at), guess, after)))
                     turns[-1].append(stores[-1])
-        stores += [Store(MISSED, (0,), total(missed))] if bends else []
-        if self.trace.piece is None:
+        stores += [Store(MISSED, (0,), total(missed))] if has_bounds else []
+        if self.trace.segment is None:
             return stores
-        self.trace.checks = list(map(_turn, turns)) if self._in_turns else [stores]
+        self.trace.check_stores = list(map(_isolate, turns)) if self._laws_in_loops else [stores]
         return found
 
-    def _waits(self, at: int) -> Value:
-        """Return non-zero in passes in which a dof, the ``at``-th of its piece, keeps its guess.
+    def _holds_guess(self, at: int) -> Value:
+        """Return non-zero in passes in which a dof, the ``at``-th of its segment, keeps its guess.
 
         Guesses that all change at once may repeat for ever, in cycles of four or five passes. Where a third of the dofs
-        changes at a time, in turns, the cycles of all random states of G1 that were found ended.
+        changes at a time, one after the other, the cycles of all random states of G1 that were found ended.
         """
-        number = self.trace.graph.input(PASS, 0) + float(at % TURNS or TURNS)  # with a text that is equal for all dofs
-        turn = number - float(TURNS) * floor(number * (1.0 / TURNS) + 0.5 / TURNS)
-        return less(PATIENCE - 0.5, self.trace.graph.input(PASS, 0)) * less(0.5, turn)
+        number = self.trace.graph.input(PASS, 0) + float(
+            at % UPDATE_PERIOD or UPDATE_PERIOD
+        )  # with a text that is equal for all dofs
+        turn = number - float(UPDATE_PERIOD) * floor(number * (1.0 / UPDATE_PERIOD) + 0.5 / UPDATE_PERIOD)
+        return less(FREE_PASSES - 0.5, self.trace.graph.input(PASS, 0)) * less(0.5, turn)
 
-    def _word(self, results: list[Value], looped: bool) -> Value:
+    def _status_word(self, results: list[Value], looped: bool) -> Value:
         """Return the most severe status of the world."""
         settled = less(self.trace.graph.input(MISSED, 0), 0.5) if looped else 1.0
-        word = select(self._opening(), Status.OPEN, select(settled, 0.0, Status.NOT_SETTLED))
+        word = select(self._constraint_error(), Status.OPEN, select(settled, 0.0, Status.NOT_SETTLED))
         word = select(all_finite(results), word, Status.PIVOT)
         known = self._inputs() + self.trace.links.lost_values()
         return select(all_finite(known), select(self._rank_loss(), Status.LOOPS, word), Status.NOT_FINITE)
 
-    def _words(self, own: Piece, results: list[Value]) -> list[Store]:
-        """Return the stores that send a piece's status to the first piece, which stores the most severe of all."""
+    def _send_status(self, own: Segment, results: list[Value]) -> list[Store]:
+        """Return the stores that send a segment's status to the first segment, which stores the most severe of all."""
         trace, graph = self.trace, self.trace.graph
         graph.step = "status|s"
         finite = select(all_finite(self._inputs()), select(all_finite(results), 0.0, Status.PIVOT), Status.NOT_FINITE)
         if own.index == 0:
             worst: Value = 0.0
-            for piece in Pieces(trace.links).pieces:
-                (word,) = trace.receive("S", piece)
+            for segment in Segments(trace.links).all:
+                (word,) = trace.receive("S", segment)
                 worst = select(less(worst, word), word, worst)
-            word = self._verdict(worst)
-            values = trace.links.lost_values()  # here, because texts of pieces of equal structure are equal
+            word = self._final_status(worst)
+            values = trace.links.lost_values()  # here, because texts of segments of equal structure are equal
             word = select(all_finite(values), word, Status.NOT_FINITE) if values else word
-            trace.rounds = [[Store("status", (), word)]]
+            trace.final_stores = [[Store("status", (), word)]]
         return trace.send("S", own, [finite])
 
     def add_bodies(self) -> None:
-        """Let a piece store poses_out, velocities_out = body_poses, body_velocities of its bodies after the step.
+        """Let a segment store poses_out, velocities_out = body_poses, body_velocities of its bodies after the step.
 
-        It reads the state after the step from the pieces that its bodies move with.
+        It reads the state after the step from the segments that its bodies move with.
         """
-        trace, own = self.trace, self.trace.piece
+        trace, own = self.trace, self.trace.segment
         assert own is not None, "by whole trees, another kernel computes the states of bodies"
-        after = {(item.array, item.index[0]): item.value for item in trace.news if item.array in ("q_out", "out")}
-        trace.news = trace.news + trace.send("X", own, map(after.__getitem__, _entries(own)))
+        after = {
+            (item.array, item.index[0]): item.value for item in trace.final_messages if item.array in ("q_out", "out")
+        }
+        trace.final_messages = trace.final_messages + trace.send("X", own, map(after.__getitem__, _entries(own)))
         sent: dict[tuple[str, int], Value] = {}
-        for piece in Pieces(trace.links).pieces:
-            sent |= dict(zip(_entries(piece), trace.receive("X", piece), strict=True))
+        for segment in Segments(trace.links).all:
+            sent |= dict(zip(_entries(segment), trace.receive("X", segment), strict=True))
         moved = trace.at({"q": lambda c: sent["q_out", c], "qd": lambda dof: sent["out", dof]})
         found = [item._replace(array="poses_out") if item.array == "out" else item for item in body_states(moved)]
-        trace.rounds = [*trace.rounds, found]
+        trace.final_stores = [*trace.final_stores, found]
 
-    def _verdict(self, worst: Value) -> Value:
-        """Return ``worst``, the most severe word of all pieces, or what the last pass adds where they are well."""
+    def _final_status(self, worst: Value) -> Value:
+        """Return ``worst``, the most severe word of all segments, or what the last pass adds where they are well."""
         settled = less(self.trace.graph.input(MISSED, 0), 0.5)
         return select(worst, worst, select(settled, 0.0, Status.NOT_SETTLED))
 
     def _inputs(self) -> list[Value]:
-        """Return all inputs of the piece's links; for the first piece also those of bodies that do not move."""
+        """Return all inputs of the segment's links; for the first segment also those of bodies that do not move."""
         trace, inputs = self.trace, [self.h]
         dofs = sorted(dof for link in self.links for dof in link.dofs)
         wide = ((link.coordinate, link.hinge.coordinates) for link in self.links)
         coordinates = sorted(first + c for first, count in wide for c in range(count))
-        own = {*map(id, trace.own_links)} | (set() if trace.piece and trace.piece.index else {id(None)})
-        bodies = sorted(body for body, seat in trace.links.seats.items() if id(seat.link) in own)
+        own = {*map(id, trace.own_links)} | (set() if trace.segment and trace.segment.index else {id(None)})
+        bodies = sorted(body for body, placement in trace.links.placements.items() if id(placement.link) in own)
         for name in trace.inputs:
             if name in ("q", "target_q", "q_from"):
                 inputs += map(trace.vector(name), coordinates)
@@ -305,26 +315,26 @@ class Step:
         return [number for number, moved in enumerate(own) if moved.intersection(dofs)]
 
 
-def _entries(piece: Piece) -> list[tuple[str, int]]:
-    """Return the arrays and indices of the entries of a piece in the state after a step."""
-    coordinates = [link.coordinate + c for link in piece.links for c in range(link.hinge.coordinates)]
-    return [*(("q_out", c) for c in coordinates), *(("out", dof) for dof in piece.dofs)]
+def _entries(segment: Segment) -> list[tuple[str, int]]:
+    """Return the arrays and indices of the entries of a segment in the state after a step."""
+    coordinates = [link.coordinate + c for link in segment.links for c in range(link.hinge.coordinates)]
+    return [*(("q_out", c) for c in coordinates), *(("out", dof) for dof in segment.dofs)]
 
 
-def by_pieces(scene: Scene) -> bool:
-    """Return whether pieces can share the work of a step: sweeps, not a matrix, serve its passes."""
-    return scene.dof_count > SHORT
+def by_segments(scene: Scene) -> bool:
+    """Return whether segments can share the work of a step: sweeps, not a matrix, serve its passes."""
+    return scene.dof_count > MOST_JOINT_SPACE_DOFS
 
 
-def _turn(stores: list[Store]) -> list[Store]:
-    """Return stores whose statements do not show what came before them."""
+def _isolate(stores: list[Store]) -> list[Store]:
+    """Return stores whose code does not depend on the statements before them."""
     values = alone((item.value for item in stores), "laws|l")
     return [item._replace(value=value) for item, value in zip(stores, values, strict=True)]
 
 
-def carries_nothing(link: Link) -> bool:
+def is_massless_subtree(link: Link) -> bool:
     """Whether no mass and no inertia, in any world, is on a link or further out."""
-    return link.inertia is None and all(map(carries_nothing, link.children))
+    return link.inertia is None and all(map(is_massless_subtree, link.children))
 
 
 def all_finite(values: list[Value]) -> Value:

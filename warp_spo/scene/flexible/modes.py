@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import UnsupportedError
-from ...hinges.hinge_type import Element, Kind
+from ...hinges.hinge_type import ElementaryHinge, HingeType
 from ..checks import SYMMETRY, checked_array, read_only
 from ..pickling import StoredPart
 
@@ -25,7 +25,7 @@ INDEFINITE = 1e-6  # least eigenvalue of a scaled mass matrix that rounding of t
 ROUNDING = 1e-12  # share of the diagonal below which an entry of a mass matrix is rounding
 
 
-class Amplitudes(Kind):
+class Amplitudes(HingeType):
     """The modal coordinates of a body: scalars whose rates are qd; see ``hinges.deflection`` for what they move."""
 
     name = "modes"
@@ -393,5 +393,5 @@ def with_modes(hinge: Any, modes: Modes | None, defaults: Mapping[str, float]) -
     vars(found).update(
         {name: read_only(np.concatenate([getattr(plain, name), values])) for name, values in added.items()}
     )
-    vars(found).update(elements=(*plain.elements, Element(Amplitudes(modes.count))), without_modes=plain)
+    vars(found).update(elements=(*plain.elements, ElementaryHinge(Amplitudes(modes.count))), without_modes=plain)
     return found

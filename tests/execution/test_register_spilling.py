@@ -8,14 +8,12 @@ import warp as wp
 from support import zoo
 from warp_spo.execution.device_facts import MEASURED
 from warp_spo.execution.plan import choose
-from warp_spo.kernels import native
-from warp_spo.kernels import shared_rows as staged_rows
-from warp_spo.kernels import straight_line as straight
+from warp_spo.kernels import native, shared_rows, straight_line
 from warp_spo.recursions.forward_dynamics import forward_dynamics_bias_first
 from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.model.tracing import Trace
 from warp_spo.trace.emission import Emitter, Store, render
-from warp_spo.trace.register_spilling import set_aside
+from warp_spo.trace.register_spilling import spill_registers
 
 TEXT = """\
 if (warp == 0) {
@@ -58,7 +56,7 @@ def simulate(text, values):
 
 
 def test_values_of_branches_are_set_aside_in_places_of_their_own():
-    few, many = (set_aside(TEXT, "float", places) for places in (1, 9))
+    few, many = (spill_registers(TEXT, "float", places) for places in (1, 9))
     assert "ASIDE(1)" not in few and "ASIDE(0)" in few
     assert "y1_from" in many and "x1_from" in many and "s3_from" in many and "c4_from" in many
     plain = simulate(TEXT, dict(a=1.0, b=10.0, s=0.0))
@@ -78,16 +76,16 @@ def test_forward_dynamics_has_the_same_bits(device):
                       lambda array, entry, value: f"if (mine) result_row[{entry}] = {value};",
                       lambda array, index: index[0], fuses=True)  # fmt: skip
     plain = render(emitter.region(stores), "float32")
-    rows = [staged_rows.Row(name, 2, array.shape[1]) for name, array in given.items()]
-    frame = straight.KernelLayout(
-        rows=rows, staged=False, fields=[], result=straight.Result(straight.DIRECT, rows[1]._replace(name="out")),
+    rows = [shared_rows.SharedRow(name, 2, array.shape[1]) for name, array in given.items()]
+    frame = straight_line.KernelLayout(
+        rows=rows, staged=False, fields=[], result=straight_line.ResultLayout(straight_line.DIRECT, rows[1]._replace(name="out")),
         messages=0, warps=1, block=32)  # fmt: skip
     found = []
     for places in (0, 4, 40):
-        text = set_aside(plain, "float", places) if places else plain
+        text = spill_registers(plain, "float", places) if places else plain
         assert (text.count("= ASIDE(") > 4) == bool(places)
         cpu = f"float aside[{places + 1}];\n#define ASIDE(i) aside[i]\n{text}\n#undef ASIDE"
-        cuda = straight.assemble(frame._replace(aside=places), text, cpu, wp.float32)
+        cuda = straight_line.assemble(frame._replace(spill_slots=places), text, cpu, wp.float32)
         kernel = native.kernel("aside", cuda, [(row.name, 2) for row in rows] + [("out", 2)], wp.float32)
         arrays = [wp.array(array, dtype=wp.float32, device=device) for array in given.values()]
         out = wp.full((40, scene.dof_count), float("nan"), dtype=wp.float32, device=device)
@@ -103,14 +101,16 @@ def test_values_are_set_aside_where_blocks_have_room():
     from warp_spo.dynamics.forward_dynamics import FORWARD_DYNAMICS
 
     scene, routine = zoo.branched(6), FORWARD_DYNAMICS.routine
-    many = choose(scene, 65536, MEASURED, "float32", varies=True)
+    many = choose(scene, 65536, MEASURED, "float32", variable_inertia=True)
     assert scene.dof_count > 32
     size = 32 * 1024
-    places = many.places_aside(routine, size, 4, 4)
+    places = many.spill_slots(routine, size, 4, 4)
     assert places >= 28 and 3 * (size + 128 * 4 * places + 3 * 1024) <= MEASURED.shared_bytes
-    assert choose(scene, 4096, MEASURED, "float32", varies=True).places_aside(routine, size, 4, 4) == 0
-    assert choose(scene, 65536, MEASURED, "float32").places_aside(routine, size, 4, 4) == 0
-    assert many.places_aside(routine, 2 * size, 8, 4) == 0
-    assert many.places_aside(routine, 2 * size, 4, 4) == 0
-    assert many.places_aside(routine.bias_first, size, 4, 4) == 0
-    assert choose(zoo.branched(3), 65536, MEASURED, "float32", varies=True).places_aside(routine, size, 4, 4) == 0
+    assert choose(scene, 4096, MEASURED, "float32", variable_inertia=True).spill_slots(routine, size, 4, 4) == 0
+    assert choose(scene, 65536, MEASURED, "float32").spill_slots(routine, size, 4, 4) == 0
+    assert many.spill_slots(routine, 2 * size, 8, 4) == 0
+    assert many.spill_slots(routine, 2 * size, 4, 4) == 0
+    assert many.spill_slots(routine.bias_first, size, 4, 4) == 0
+    assert (
+        choose(zoo.branched(3), 65536, MEASURED, "float32", variable_inertia=True).spill_slots(routine, size, 4, 4) == 0
+    )

@@ -1,4 +1,4 @@
-"""Pieces of a scene as warps: barriers between them, results through shared memory, limbs that share code."""
+"""Segments of a scene as warps: barriers between them, results through shared memory, limbs that share code."""
 
 import itertools
 import re
@@ -9,44 +9,46 @@ import pytest
 import warp_spo as spo
 from support import laws, warp_machine, zoo
 from support.granularity_scenes import mirrored
-from support.pieces_of_trees import TREES, hand
+from support.segments_of_trees import TREES, hand
 from support.quick import slow_unless
 from support.robots import ROBOTS
 from support.routines import ROUTINES
 from warp_spo.execution import plan
-from warp_spo.execution.segment import shared_code as shared_text
-from warp_spo.kernels import straight_line as straight
-from warp_spo.recursions.model import shared_constants as alike
+from warp_spo.execution.segment import shared_code
+from warp_spo.kernels import straight_line
+from warp_spo.recursions.model import shared_constants
 from warp_spo.recursions.model.links import Links
-from warp_spo.recursions.model.segments import Pieces
+from warp_spo.recursions.model.segments import Segments
 
 LARGE = ("tree20", "three roots", "humanoid")  # seconds: a quick run takes smaller trees of the same shapes
 EVERY = ("fork", "comb")  # trees of which a quick run takes every operation
 
 
 @pytest.mark.parametrize("name", TREES)
-def test_pieces_are_segments(name):
-    """Every link is in one piece; a piece is a chain that ends where the tree branches; a leaf has its own warp."""
+def test_segments_are_chains(name):
+    """Every link is in one segment; a segment is a chain that ends where the tree branches; a leaf has its own warp."""
     links = Links(TREES[name]())
-    pieces = Pieces(links)
-    assert sorted(id(link) for piece in pieces.pieces for link in piece.links) == sorted(map(id, links.links))
-    for piece in pieces.pieces:
-        for over, link in zip(piece.links, piece.links[1:], strict=False):
+    segments = Segments(links)
+    assert sorted(id(link) for segment in segments.all for link in segment.links) == sorted(map(id, links.links))
+    for segment in segments.all:
+        for over, link in zip(segment.links, segment.links[1:], strict=False):
             assert link.parent is over and len(over.children) == 1
-        assert len(piece.children) != 1 and len(piece.children) == len(piece.links[-1].children)
-        assert all(child.index > piece.index and child.links[0].parent is piece.links[-1] for child in piece.children)
-    leaves = [piece.warp for piece in pieces.pieces if not piece.children]
-    assert sorted(leaves) == [*range(pieces.warps)]
+        assert len(segment.children) != 1 and len(segment.children) == len(segment.links[-1].children)
+        assert all(
+            child.index > segment.index and child.links[0].parent is segment.links[-1] for child in segment.children
+        )
+    leaves = [segment.warp for segment in segments.all if not segment.children]
+    assert sorted(leaves) == [*range(segments.warps)]
 
 
 @pytest.mark.parametrize("name", TREES)
-def test_pieces_wait_for_each_other(name):
+def test_segments_wait_for_each_other(name):
     """A warp reads results of other warps only from earlier stages; within a warp, inward comes before outward."""
-    for piece in (pieces := Pieces(Links(TREES[name]()))).pieces:
-        assert 0 <= piece.inward <= piece.outward < pieces.stages
-        for child in piece.children:
-            assert child.inward + (child.warp != piece.warp) <= piece.inward
-            assert piece.outward + (child.warp != piece.warp) <= child.outward
+    for segment in (segments := Segments(Links(TREES[name]()))).all:
+        assert 0 <= segment.inward <= segment.outward < segments.stages
+        for child in segment.children:
+            assert child.inward + (child.warp != segment.warp) <= segment.inward
+            assert segment.outward + (child.warp != segment.warp) <= child.outward
 
 
 SEGMENTED = {"forward_dynamics": ("qd", "tau", "body_f"), "inverse_dynamics": ("qd", "qdd", "body_f"),
@@ -98,7 +100,7 @@ def test_results_over_rows_that_warps_share(name, operation, monkeypatch):
     monkeypatch.setattr(plan, "FEW_WORLDS", 0)
     texts = warp_machine.recorded(monkeypatch)
     text, arrays, wanted = built(texts, TREES[name](), operation)
-    assert text.frame.staged or not text.frame.result.way == straight.IN_PLACE
+    assert text.frame.staged or not text.frame.result.way == straight_line.IN_PLACE
     for backwards in (False, True):
         got = warp_machine.run(text, arrays, backwards)
         assert laws.error(got, wanted.reshape(got.shape)) <= laws.TOLERANCE["float64"]
@@ -114,19 +116,19 @@ def test_results_that_leave_through_shared_memory(monkeypatch):
         call(spo.Dynamics(scene, 3, device="cpu", granularity="tree"))
         return texts[-1].frame
 
-    for wrt, ways in ((("q", "qd", "tau"), (straight.STAGED, 2)), (("q", "qd"), (straight.DIRECT, 0))):
+    for wrt, ways in ((("q", "qd", "tau"), (straight_line.STAGED, 2)), (("q", "qd"), (straight_line.DIRECT, 0))):
         found = frame(lambda dyn, wrt=wrt: dyn.forward_dynamics_vjp(q, qd, tau, cotangent=tau, wrt=wrt))
         assert (found.result.way, len(found.staged_further)) == ways and not found.staged
-    assert frame(lambda dyn: dyn.inverse_dynamics(q, qd, tau)).result.way == straight.DIRECT
-    assert frame(lambda dyn: dyn.inverse_dynamics(q, qd, tau), few=0).result.way == straight.STAGED
+    assert frame(lambda dyn: dyn.inverse_dynamics(q, qd, tau)).result.way == straight_line.DIRECT
+    assert frame(lambda dyn: dyn.inverse_dynamics(q, qd, tau), few=0).result.way == straight_line.STAGED
 
 
 @pytest.mark.parametrize("name", ["fork", "hand"])
 def test_turns_are_loops_where_code_is_long(name, monkeypatch):
     """Columns that meet one another's, in a row and in loops."""
     texts, got = warp_machine.recorded(monkeypatch), []
-    for most in (shared_text.CACHED, 0):
-        monkeypatch.setattr(shared_text, "CACHED", most)
+    for most in (shared_code.CACHED, 0):
+        monkeypatch.setattr(shared_code, "CACHED", most)
         text, arrays, wanted = built(texts, TREES[name](), "mass_matrix_inverse")
         assert ("++each" in text.cuda) == (most == 0)
         got.append(warp_machine.run(text, arrays))
@@ -187,7 +189,7 @@ def test_mirrored_limbs_share_one_text(operation, monkeypatch):
     """Numbers in which they differ come from a table, where each leg alone would drop zeros, ones and signs."""
     texts = warp_machine.recorded(monkeypatch)
     together, *_ = built(texts, mirrored(), operation)
-    monkeypatch.setattr(alike, "differing", lambda pieces, *_: [frozenset()] * len(pieces))
+    monkeypatch.setattr(shared_constants, "find_differing", lambda segments, *_: [frozenset()] * len(segments))
     apart, *_ = built(texts, mirrored(), operation)
     assert len(branches(together)) <= 2 < len(branches(apart))
     assert together.cuda.count(" = ") < 0.8 * apart.cuda.count(" = ")
