@@ -89,8 +89,9 @@ def measure(scene: spo.Scene, row: str, worlds: int, device: wp.Device) -> dict[
     names = ("target_q",) if options.get("drives") else ("ctrl",) if scene.actuators else ()
 
     def given(arrays: list, buffers: Any) -> dict[str, Any]:
-        more = {name: arrays[3] if name == "target_q" else arrays[2] for name in names}
-        return more | ({"actuator_state": buffers} if buffers is not None else {}) | {"substeps": substeps}
+        more: dict[str, Any] = {name: arrays[3] if name == "target_q" else arrays[2] for name in names}
+        more |= {"options": spo.StepOptions(substeps=substeps)}
+        return more | ({"actuator_state": buffers} if buffers is not None else {})
 
     late = any(actuator.delay for actuator in scene.actuators)
     buffers, twin = (one.actuator_state(like) if late else None for one, like in ((dyn, on[0][0]), (exact, sets[0][0])))

@@ -75,7 +75,7 @@ def ours(
     poses: Any = dyn.body_poses(q)
 
     def advance() -> None:
-        dyn.step(q, qd, None, dt, integrator=integrator, substeps=count, out=(q, qd))
+        dyn.step(q, qd, None, dt, options=spo.StepOptions(integrator=integrator, substeps=count), out=(q, qd))
         dyn.body_poses(q, out=poses)
 
     advance()  # compiles

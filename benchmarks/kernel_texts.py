@@ -27,6 +27,7 @@ import warp as wp
 
 import warp_spo as spo
 from warp_spo.dynamics import dynamics
+from warp_spo.dynamics.stepping.options import REPORT
 from warp_spo.examples import biped, fivebar, fourbar, slider_crank, stewart
 from warp_spo.execution.device_facts import MEASURED
 from warp_spo.kernels import native
@@ -166,9 +167,10 @@ def calls(dyn: spo.Dynamics) -> Iterator[tuple[str, Callable[[], Any]]]:
         if dyn.worlds * entries.get(operation, 0) > MOST_ENTRIES:
             continue
         yield operation, lambda operation=operation, more=more: dyn.prepare(operation, **more)
-        optional = {
-            one.name: True for one in declared[operation].arrays if one.asked and _is_there(one.name, dyn.scene)
-        }
+        asked = [one for one in declared[operation].arrays if one.asked and _is_there(one.name, dyn.scene)]
+        reports = tuple(one.name for one in asked if one.name in REPORT.members) if operation == "step" else ()
+        optional: dict[str, Any] = {one.name: True for one in asked if one.name not in reports}
+        optional |= {"report": reports} if reports else {}
         if optional:
             yield f"{operation}+", lambda operation=operation, more=more | optional: dyn.prepare(operation, **more)
     backwards = {f"{name}_vjp": one.derivative for name, one in declared.items() if one.derivative is not None}
@@ -183,7 +185,7 @@ def calls(dyn: spo.Dynamics) -> Iterator[tuple[str, Callable[[], Any]]]:
             wrt = (*own, *(name for name in values if name in backwards[product].values))
             yield f"{product} {' '.join(wrt)}", lambda product=product, wrt=wrt: dyn.prepare(product, wrt=wrt)
     yield "forward_dynamics_vjp tangent", lambda: dyn.prepare("forward_dynamics_vjp", wrt=("tangent", "qd"))
-    yield "step midpoint", lambda: dyn.prepare("step", integrator="midpoint")
+    yield "step midpoint", lambda: dyn.prepare("step", options=spo.StepOptions(integrator="midpoint"))
     yield "operators", lambda: expressions(dyn)
 
 

@@ -196,7 +196,7 @@ def mujoco_errors(scene: spo.Scene, q: np.ndarray, qd: np.ndarray) -> dict[tuple
     def after(dt: float, integrator: str) -> np.ndarray:
         ours, rate = (wp.array(x[None], dtype=wp.float64, device="cpu") for x in (q, qd))
         for _ in range(round(COMPARED / dt)):
-            dyn.step(ours, rate, None, dt, integrator=integrator, out=(ours, rate))
+            dyn.step(ours, rate, None, dt, options=spo.StepOptions(integrator=integrator), out=(ours, rate))
         return ours.numpy()[0][order]
 
     wanted = mujoco_after(FINE)

@@ -78,7 +78,7 @@ def prepare(name: str, worlds: int, device: wp.Device, count: int) -> Callable[[
     outs = [tuple(wp.empty_like(sets[0][key]) for key in ("q", "qd")) for _ in range(2)]
 
     def fused(k: int) -> None:
-        dyn.step(**sets[k], dt=DT, substeps=count, out=outs[0])
+        dyn.step(**sets[k], dt=DT, options=spo.StepOptions(substeps=count), out=outs[0])
 
     def calls(k: int) -> None:
         given = dict(sets[k])

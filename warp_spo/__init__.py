@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from .dynamics.actuators import ActuatorState
 from .dynamics.dynamics import Dynamics
+from .dynamics.stepping.options import StepOptions, StepReport
 from .errors import DirectedLoopError, UnsupportedError
 from .execution.tuned import Tuned
 from .graph.factorization import Factorization
@@ -63,6 +64,8 @@ __all__ = [
     "Scene",
     "Section",
     "Status",
+    "StepOptions",
+    "StepReport",
     "Tree",
     "Tuned",
     "UnsupportedError",

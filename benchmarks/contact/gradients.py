@@ -56,7 +56,15 @@ def measure(
 
     def step(i: int) -> None:
         one = given[i]
-        dyn.step(one["q"], one["qd"], one["tau"], DT, qdd=one["qdd"], passes=passes, out=out)
+        dyn.step(
+            one["q"],
+            one["qd"],
+            one["tau"],
+            DT,
+            report=spo.StepReport(qdd=one["qdd"]),
+            options=spo.StepOptions(passes=passes),
+            out=out,
+        )
 
     def back(i: int) -> None:
         dyn._gradients.launch(derivative_of(STEP), wrt, outs, {**given[i], "dt": DT, "passes": passes})
@@ -69,7 +77,14 @@ def measure(
     few = min(worlds, SAMPLE)
     exact = spo.Dynamics(dyn.scene, few, "cpu", "float64")
     twin = {name: wp.array(x.numpy()[:few], dtype=wp.float64, device="cpu") for name, x in given[0].items()}
-    exact.step(twin["q"], twin["qd"], twin["tau"], DT, qdd=twin["qdd"], passes=passes)
+    exact.step(
+        twin["q"],
+        twin["qd"],
+        twin["tau"],
+        DT,
+        report=spo.StepReport(qdd=twin["qdd"]),
+        options=spo.StepOptions(passes=passes),
+    )
     wanted = [wp.empty_like(twin[name]) for name in WRT]
     exact._gradients.launch(derivative_of(STEP), WRT, wanted, {**twin, "dt": DT, "passes": passes})
     errors = []

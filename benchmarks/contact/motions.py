@@ -66,14 +66,15 @@ def record(
     worlds, points = len(q), len(dyn.scene.contact_points)
     force, excess = np.zeros((worlds, points, 3)), np.zeros((worlds, 3))
     gap, slip = np.zeros((worlds, points)), np.zeros((worlds, points))
-    reports = dict(contact_f=force, contact_excess=excess, contact_gap=gap, contact_slip=slip)
+    options = spo.StepOptions(passes=passes)
+    report = spo.StepReport(contact_f=force, contact_excess=excess, contact_gap=gap, contact_slip=slip)
     every = max(1, round(CONTROL / dt))
     found: dict[str, list] = {name: [] for name in ("q", "qd", "f", "excess", "jitter")}
     for period in range(round(seconds / CONTROL)):
         wanted, given = target(period * CONTROL), {} if push is None else {"body_f": push(period * CONTROL)}
         sums, worst, totals = np.zeros_like(force), np.zeros_like(excess), []
         for _ in range(every):
-            q, qd = dyn.step(q, qd, None, dt, target_q=wanted, passes=passes, **reports, **given)
+            q, qd = dyn.step(q, qd, None, dt, target_q=wanted, options=options, report=report, **given)
             sums += force / every
             worst = np.maximum(worst, excess)
             totals.append(force.sum(axis=1)[:, 2])

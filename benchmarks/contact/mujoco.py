@@ -85,7 +85,7 @@ def stand(model: Any, scene: spo.Scene) -> tuple[np.ndarray, np.ndarray]:
             q[scene.q_start[joint]] = angle
     at = spo.Dynamics(scene, 1, dtype="float64")
     gap = np.zeros((1, len(scene.contact_points)))
-    at.step(q[None], np.zeros((1, scene.dof_count)), None, 1e-4, contact_gap=gap)
+    at.step(q[None], np.zeros((1, scene.dof_count)), None, 1e-4, report=spo.StepReport(contact_gap=gap))
     q[2] -= gap.min()
     ctrl = np.array([q[scene.q_start[actuator.hinges[0]]] for actuator in scene.actuators])
     return q, ctrl
@@ -101,13 +101,31 @@ def ours(scene: spo.Scene, q0: np.ndarray, ctrl: np.ndarray, dt: float, passes: 
     base = next(i for i, label in enumerate(scene.body_labels) if label.endswith("pelvis"))
     at = np.array([point.position for point in scene.contact_points])
     places, pressures, spent = [], [], 0.0
-    dyn.step(q, qd, None, dt, ctrl=controls, body_f=body_f, passes=passes, contact_f=force)
+    dyn.step(
+        q,
+        qd,
+        None,
+        dt,
+        ctrl=controls,
+        body_f=body_f,
+        options=spo.StepOptions(passes=passes),
+        report=spo.StepReport(contact_f=force),
+    )
     for period in range(round(seconds / 1e-2)):
         body_f[:, base, 0] = push * (BEGIN - 1e-9 <= period * 1e-2 < END - 1e-9)
         began = time.perf_counter()
         for _ in range(every):
             before = q
-            q, qd = dyn.step(q, qd, None, dt, ctrl=controls, body_f=body_f, passes=passes, contact_f=force)
+            q, qd = dyn.step(
+                q,
+                qd,
+                None,
+                dt,
+                ctrl=controls,
+                body_f=body_f,
+                options=spo.StepOptions(passes=passes),
+                report=spo.StepReport(contact_f=force),
+            )
         spent += time.perf_counter() - began
         places.append(q[0, :3].copy())
         poses = dyn.body_poses(before)[0]

@@ -118,7 +118,7 @@ def measure(name: str, worlds: int, device: wp.Device, passes: int | None = None
     out = tuple(wp.zeros_like(x) for x in given[0][:2])
 
     def step(index: int) -> None:
-        dyn.step(*given[index], scenes.DT, passes=passes, out=out)
+        dyn.step(*given[index], scenes.DT, options=spo.StepOptions(passes=passes), out=out)
 
     step(0)
     after, errors = out[1].numpy(), []

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+import warp_spo as spo
 from warp_spo.reference.contact import ContactStep
 
 from ..capabilities import measure_time
@@ -41,28 +42,29 @@ def prepare(
     field: bool = False,
     contacts: bool = True,
     passes: int | None = None,
-    **options: Any,
+    **more: Any,
 ) -> Callable[[], dict[str, Any]]:
     """Take a step; return what measures ``us`` and errors against the dense step: of velocities, of forces over weight.
 
     ``contacts``: False measures the time of the step without ground, where drives and limits settle in passes.
     """
-    dyn, sets = subject(robot, worlds, device, field, contacts, **options)
+    dyn, sets = subject(robot, worlds, device, field, contacts, **more)
     out, (q, qd) = tuple(wp.empty_like(x) for x in sets[0]), sets[0]
-    force = force_array(dyn) if contacts else None
+    force, options = force_array(dyn) if contacts else None, spo.StepOptions(passes=passes)
+    report = spo.StepReport(contact_f=force)
 
     def step(index: int) -> None:
-        dyn.step(*sets[index], None, DT, passes=passes, out=out)
+        dyn.step(*sets[index], None, DT, options=options, out=out)
 
     step(0)
     if force is not None:
-        dyn.step(q, qd, None, DT, passes=passes, contact_f=force)
+        dyn.step(q, qd, None, DT, options=options, report=report)
 
     def run() -> dict[str, Any]:
         found: dict[str, Any] = {"us": measure_time(step, device), "kernel": dyn.programs.described()[0]}
         if force is None:
             return found
-        after = dyn.step(q, qd, None, DT, passes=passes, contact_f=force)[1].numpy()
+        after = dyn.step(q, qd, None, DT, options=options, report=report)[1].numpy()
         weight, start = 9.81 * dyn.scene.values["body_mass"].sum(), [x.numpy().astype(np.float64) for x in (q, qd)]
         errors = []
         for w in range(0, worlds, max(1, worlds // SAMPLE)):

@@ -74,7 +74,17 @@ def throw(scene: spo.Scene, worlds: int, passes: int, device: str, seed: int) ->
               "steps with status CONTACT": 0}  # fmt: skip
     seen, began = torch.zeros(worlds, dtype=torch.bool, device=where), time.perf_counter()
     for _ in range(round(SECONDS / DT) + 1):
-        dyn.step(q, qd, None, DT, target_q=target, passes=passes, contact_gap=gap, status=status, out=out)
+        dyn.step(
+            q,
+            qd,
+            None,
+            DT,
+            target_q=target,
+            options=spo.StepOptions(passes=passes),
+            report=spo.StepReport(contact_gap=gap),
+            status=status,
+            out=out,
+        )
         energy = energies(torch, dyn, values, target, q, qd, gap)
         if before is None:
             start = energy

@@ -39,7 +39,7 @@ def check_falling_cubes(where: Setting) -> None:
     force = np.zeros((worlds, 8, 3), number)
     status, lost = np.zeros(worlds, np.int32), np.zeros(worlds, bool)
     for _ in range(round(SECONDS / DT)):
-        q, qd = dyn.step(q, qd, None, DT, contact_f=force, status=status)
+        q, qd = dyn.step(q, qd, None, DT, report=spo.StepReport(contact_f=force), status=status)
         lost |= (status != 0) & (status != spo.Status.CONTACT)
     whole = np.isfinite(q).all(axis=1) & np.isfinite(qd).all(axis=1)
     assert (whole | lost).all(), f"{(~whole & ~lost).sum()} worlds are lost without a status"

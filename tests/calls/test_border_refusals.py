@@ -284,7 +284,7 @@ def test_numpy_arrays_to_be_filled_have_the_dtype_of_what_fills_them(device):
                 call(np.zeros(WORLDS, dtype))
     for dtype in (int, np.float32):
         with explained(ValueError, "Dynamics.step: qdd is a NumPy array", "expected float64", "convert it"):
-            dyn.step(a["q"], a["qd"], None, 1e-3, qdd=np.zeros(a["qd"].shape, dtype))
+            dyn.step(a["q"], a["qd"], None, 1e-3, report=spo.StepReport(qdd=np.zeros(a["qd"].shape, dtype)))
 
 
 def test_masks_are_bools_and_tensors_are_dense(device):

@@ -287,4 +287,4 @@ def test_rk4_refuses_friction_and_rates_that_may_come(device):
     dyn = limited(device)
     a = laws.states(scene(), WORLDS)
     with pytest.raises(spo.UnsupportedError, match="friction or velocity limits"):
-        dyn.step(a["q"], a["qd"], None, H, integrator="rk4")
+        dyn.step(a["q"], a["qd"], None, H, options=spo.StepOptions(integrator="rk4"))

@@ -8,6 +8,7 @@ import pytest
 import warp_spo as spo
 from support import symbolic
 from support.contact_cases import box, quadruped
+from support.step_calls import bundled
 from warp_spo.kernels import native
 from warp_spo.recursions.contact import contact_culling
 from warp_spo.recursions.model import shared_constants
@@ -55,7 +56,7 @@ def run(monkeypatch, device, scene, always, dtype, steps, worlds=256):
                 name: np.full((worlds, count, size)[: 2 + (size > 1)], np.nan, dtype) for name, size in REPORTS.items()
             }
             more |= {"contact_excess": np.full((worlds, 3), np.nan, dtype), "status": np.full(worlds, -1, np.int32)}
-            q, qd = dyn.step(q, qd, None, 5e-3, **more)
+            q, qd = dyn.step(q, qd, None, 5e-3, **bundled(**more))
             found.append({"q": q.copy(), "qd": qd.copy(), **more})
     return found
 
@@ -147,7 +148,7 @@ def test_limbs_of_one_make(monkeypatch, device, kind, axes):
     for granularity in ("tree", "segment"):
         dyn = spo.Dynamics(scene, 16, device=device, dtype="float64", granularity=granularity)
         force = np.zeros((16, len(scene.contact_points), 3))
-        found.append((*dyn.step(q, qd, None, 5e-3, contact_f=force), force))
+        found.append((*dyn.step(q, qd, None, 5e-3, report=spo.StepReport(contact_f=force)), force))
     assert texts and any(texts[0]) and found[0][2].any()
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-10 * max(1.0, np.abs(one).max()))

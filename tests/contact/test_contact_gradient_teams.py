@@ -106,7 +106,14 @@ def test_limbs_of_a_gpu_and_a_thread_of_a_cpu_agree(passes, device):
         dyn = spo.Dynamics(scene, count, on, "float64", variable=("contact_friction",))
         given = {n: wp.array(x[:count], dtype=wp.float64, device=on) if np.ndim(x) else x for n, x in a.items()}
         given["qdd"] = wp.zeros_like(given["qd"])
-        dyn.step(given["q"], given["qd"], given["tau"], H, qdd=given["qdd"], passes=passes)
+        dyn.step(
+            given["q"],
+            given["qd"],
+            given["tau"],
+            H,
+            report=spo.StepReport(qdd=given["qdd"]),
+            options=spo.StepOptions(passes=passes),
+        )
         outs = [wp.full(dyn._gradients.shape_of(STEP, n), np.nan, dtype=wp.float64, device=on) for n in WRT]
         dyn._gradients.launch(derivative_of(STEP), WRT, outs, given)
         found.append([out.numpy() for out in outs])
@@ -129,15 +136,15 @@ BUGS = {
     "what a limb hands on": (
         PassGradient,
         "stores",
-        'trace.exchange.receive("G", segment)[: len(self.passed_on)]',
+        'trace.receive("G", segment)[: len(self.passed_on)]',
         "[0.0] * len(self.passed_on)",
     ),
     "what points on the trunk hand on": (PassGradient, "_carry", "if link is not self._under:", "if True:"),
     "how inertias count": (
         PassSolve,
         "_tell",
-        'exchange.send("Q", segment, gradients)',
-        'exchange.send("Q", segment, [0.0] * len(ways))',
+        'trace.send("Q", segment, gradients)',
+        'trace.send("Q", segment, [0.0] * len(ways))',
     ),
     "how inertias count in memory": (
         PassGradient,

@@ -191,7 +191,7 @@ def test_a_rollout_is_differentiated():
         q, qd = q0, qd0
         for at in range(hop.STEPS):
             tau = torch.nn.functional.pad(torques[4 * at // hop.STEPS], (1, 0))
-            q, qd = dyn.step(q, qd, tau, hop.DT, target_q=q0, contact_f=force)
+            q, qd = dyn.step(q, qd, tau, hop.DT, target_q=q0, report=spo.StepReport(contact_f=force))
             touched.append(force[:, 0, 2] > 0.0)
         return (q * q).sum(1) + 0.1 * (qd * qd).sum(1)
 
@@ -265,7 +265,7 @@ def test_a_tape_differentiates_the_solver():
     def last(q, qd, mu):
         dyn.set(contact_friction=mu)
         for _ in range(steps):
-            q, qd = dyn.step(q, qd, None, H, passes=4)
+            q, qd = dyn.step(q, qd, None, H, options=spo.StepOptions(passes=4))
         return (qd * seeds).sum(axis=1)
 
     nudge = 1e-6
@@ -322,7 +322,7 @@ def test_jax_differentiates_the_step(device):
     wanted = torch.autograd.grad(loss(dyn, {n: t if n in ("q", "qd", "tau", "target_q") else t.detach()
                                             for n, t in tensors.items()}, substeps=2).sum(), (q, qd, tau))  # fmt: skip
     with jax.enable_x64(True):
-        step = spo_jax.function(dyn, "step", dt=H, substeps=2)
+        step = spo_jax.function(dyn, "step", dt=H, options=spo.StepOptions(substeps=2))
 
         def number(q, qd, tau):
             after, rate = step(q, qd, tau, target_q=targets.detach().numpy())

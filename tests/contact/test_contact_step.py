@@ -10,6 +10,7 @@ import warp_spo as spo
 from support import actuated, symbolic, zoo
 from support.contact_cases import box, everywhere, quadruped, touching
 from support.contact_steps import FIELDS, H, above, assert_is_dense, by_point
+from support.step_calls import bundled
 from support.step_scenes import furnished, states
 from warp_spo.dynamics.stepping import contact_options
 from warp_spo.recursions.contact import dampers, ground, law, points, secant_laws, step, velocity_kicks
@@ -117,7 +118,9 @@ def test_the_kernel_of_a_height_field(device):
     a = above(scene, 3, WORLDS)
     dyn = spo.Dynamics(scene, WORLDS, device=device)
     force = np.full((WORLDS, 1, 3), np.nan, np.float32)
-    q, qd = dyn.step(a["q"].astype(np.float32), a["qd"].astype(np.float32), None, H, contact_f=force)
+    q, qd = dyn.step(
+        a["q"].astype(np.float32), a["qd"].astype(np.float32), None, H, report=spo.StepReport(contact_f=force)
+    )
     weight, (velocity, pushed) = 5.0 * 9.81, TOLERANCE["float32"]
     for w in range(WORLDS):
         at = ContactStep(scene, a["q"][w], a["qd"][w], H)
@@ -159,7 +162,7 @@ def test_grounds_of_worlds(name, ground, values, device):
     later.set(**{part: np.float32(value) for part, value in given.items()})
     for dyn in (spo.Dynamics(scene, WORLDS, device), later):
         force = np.full((WORLDS, 8, 3), np.nan, np.float32)
-        _, qd = dyn.step(np.float32(a["q"]), np.float32(a["qd"]), None, H, contact_f=force)
+        _, qd = dyn.step(np.float32(a["q"]), np.float32(a["qd"]), None, H, report=spo.StepReport(contact_f=force))
         assert (np.abs(force).sum(axis=(1, 2)) > 1.0).all()
         for w in range(WORLDS):
             at = ContactStep(scene, a["q"][w], a["qd"][w], H, world=w)
@@ -207,16 +210,12 @@ BUGS = {
     "wrong lever": (dampers, "_mass", "r * weight", "r * (2.0 * weight)"),
     "riser unseen": (ground, "surfaces", "_cell((x + moves[0] - ground.origin[0]) * rate_x, rows)[0]", "i"),
     "velocity terms of the path alone": (velocity_kicks, "_kick", "forces.__getitem__", "zero"),
-    "rates of the last round": (velocity_kicks, "final_kick", "2.0 * (kick[dof] - previous_kick(dof))", "0.0"),
+    "rates of the last round": (velocity_kicks, "final_kick",
+                                     "2.0 * (kick[dof] - previous_kick(dof))", "0.0"),
     "points along other rates": (points, "place_points", "w, v = mine.travel", "w, v = mine.twist"),
     "forces at the start": (step.ContactStepTrace, "__init__", 'trace.substitutes.pop("q", None)', "None"),
     "points half way": (points, "place_points", "depth + (0.5 * h)", "depth + (0.4 * h)"),
-    "weights of the neutral pose": (
-        step.ContactStepTrace,
-        "_step_over_inertia",
-        "not in single_dofs",
-        "in single_dofs",
-    ),
+    "weights of the neutral pose": (step.ContactStepTrace, "_step_over_inertia", "not in single_dofs", "in single_dofs"),
     "straight paths": (points, "place_points", "(0.5 * h) * faster", "0.0"),
     "damper of straight paths": (points, "place_points", "k * below - damping * faster", "k * below"),
     "damping that does not grow": (points, "place_points", "d * (k * select(less(0.0, depth), depth, 0.0))", "d"),
@@ -249,7 +248,7 @@ def stepped(dyn, state, passes=None, **more):
     found = {name: np.full((WORLDS, count, *size), np.nan, dtype) for name, size in SIZES.items()}
     found |= {"contact_excess": np.full((WORLDS, 3), np.nan, dtype), "status": np.full(WORLDS, -1, np.int32)}
     q, qd, tau = (x.astype(dtype) for x in state)
-    found["q"], found["qd"] = dyn.step(q, qd, tau, H, passes=passes, **found, **more)
+    found["q"], found["qd"] = dyn.step(q, qd, tau, H, **bundled(passes=passes, **found, **more))
     return found
 
 
@@ -327,7 +326,7 @@ def test_points_are_switched_off_in_some_worlds(device, granularity):
     for factor in (None, no_feet, 1.0):
         if factor is not None:
             dyn.set(worlds=off, **{name: factor * scene.values[name][0] for name in dyn.variable})
-        found.append(dyn.step(q, qd, tau, H, contact_f=force)[1])
+        found.append(dyn.step(q, qd, tau, H, report=spo.StepReport(contact_f=force))[1])
         assert force[~off, :4].any() and force[off, :4].any() == (factor is not no_feet)
     np.testing.assert_array_equal(found[1][~off], found[0][~off])
     np.testing.assert_array_equal(found[2], found[0])
@@ -361,7 +360,7 @@ def test_calls_without_a_kernel_have_names(device, mistake):
     more, kind, message = REFUSALS[mistake]
     q, qd = np.tile(quadruped().neutral_q, (WORLDS, 1)).astype(np.float32), np.zeros((WORLDS, 18), np.float32)
     with pytest.raises(kind, match=message):
-        dynamics(str(device), "float32", "tree").step(q, qd, None, H, **more)
+        dynamics(str(device), "float32", "tree").step(q, qd, None, H, **bundled(**more))
 
 
 def test_scenes_without_a_kernel_have_names(device, monkeypatch):
@@ -374,8 +373,8 @@ def test_scenes_without_a_kernel_have_names(device, monkeypatch):
     bare = spo.Dynamics(box().with_contacts([]), device=device)
     for name, value in (("passes", 3), ("contact_gap", np.zeros((1, 0), np.float32))):
         with pytest.raises(ValueError, match=f"{name} is given, and the scene has no contacts"):
-            bare.step(q, qd, None, H, **{name: value})
+            bare.step(q, qd, None, H, **bundled(**{name: value}))
     post = spo.Scene([spo.Body(1.0)], [spo.Hinge("fixed", -1, 0)], contacts=[spo.Contact(0, point=(0, 0, 0))])
     none, gap = np.zeros((1, 0), np.float32), np.full((1, 1), np.nan, np.float32)
     with pytest.raises(spo.UnsupportedError, match="contact_gap of a scene in which nothing can move"):
-        spo.Dynamics(post, device=device).step(none, none, None, H, contact_gap=gap)
+        spo.Dynamics(post, device=device).step(none, none, None, H, report=spo.StepReport(contact_gap=gap))

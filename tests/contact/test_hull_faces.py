@@ -162,7 +162,7 @@ def test_stones_that_meet_keep_their_momentum(device):
         0,
     )
     for _ in range(60):
-        q, qd = dyn.step(q, qd, None, 5e-3, contact_f=force)
+        q, qd = dyn.step(q, qd, None, 5e-3, report=spo.StepReport(contact_f=force))
         met = np.maximum(met, np.abs(force).max(axis=(1, 2)))
     assert (met > 1.0).sum() > 15
     np.testing.assert_allclose(momentum(scene, q, qd), before, atol=1e-11)

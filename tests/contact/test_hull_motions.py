@@ -24,7 +24,7 @@ def throw_rock(dtype, device, steps):
     before, dyn, met = momentum(scene, q, qd), spo.Dynamics(scene, worlds, device=device, dtype=dtype), 0.0
     force = np.zeros((worlds, 1, 3), dtype)
     for _ in range(steps):
-        q, qd = dyn.step(q, qd, None, H, contact_f=force)
+        q, qd = dyn.step(q, qd, None, H, report=spo.StepReport(contact_f=force))
         met = np.maximum(met, np.abs(force).max(axis=(1, 2)))
     return before, momentum(scene, q, qd), met
 

@@ -95,7 +95,7 @@ def test_rounds_that_do_not_settle_have_a_word(device):
     a, status = flying(scene, 1.0), np.full(WORLDS, -1, np.int32)
     a["qd"] *= np.array([[1.0], [200.0], [0.0]])
     dyn = spo.Dynamics(scene, WORLDS, device=device, dtype="float64")
-    dyn.step(a["q"], a["qd"], None, H, passes=4, status=status)
+    dyn.step(a["q"], a["qd"], None, H, options=spo.StepOptions(passes=4), status=status)
     assert status.tolist() == [spo.Status.OK, spo.Status.NOT_SETTLED, spo.Status.OK]
     dyn.step(a["q"], a["qd"], None, H, status=status)
     assert not status.any()
@@ -110,11 +110,11 @@ def test_the_state_may_be_overwritten(device, substeps):
     dyn = spo.Dynamics(quadruped(contact_cases.EFFORT), 70, device=device, dtype="float64")
     wanted = q, qd
     for _ in range(substeps):
-        wanted = dyn.step(*wanted, tau, H, passes=4)
+        wanted = dyn.step(*wanted, tau, H, options=spo.StepOptions(passes=4))
     for places in ((0, 1), (0,), (1,)):
         mine = wp.clone(q), wp.clone(qd)
         out = [mine[i] if i in places else wp.empty_like(mine[i]) for i in (0, 1)]
-        dyn.step(*mine, tau, H, passes=4, out=tuple(out), substeps=substeps)
+        dyn.step(*mine, tau, H, options=spo.StepOptions(passes=4, substeps=substeps), out=tuple(out))
         for found, right in zip(out, wanted, strict=True):
             np.testing.assert_array_equal(found.numpy(), right.numpy(), err_msg=str(places))
 
@@ -124,7 +124,7 @@ def test_the_acceleration_is_that_of_the_whole_step(device):
     q, qd, tau = contact_cases.touching(quadruped(contact_cases.EFFORT), 3, 70)
     dyn = spo.Dynamics(quadruped(contact_cases.EFFORT), 70, device=device, dtype="float64")
     qdd = np.full_like(qd, np.nan)
-    _, after = dyn.step(q, qd, tau, H, passes=4, qdd=qdd)
+    _, after = dyn.step(q, qd, tau, H, options=spo.StepOptions(passes=4), report=spo.StepReport(qdd=qdd))
     np.testing.assert_allclose(qd + H * qdd, after, atol=ROUNDING * abs(after).max())
 
 
@@ -168,7 +168,7 @@ def test_gradients_by_centres_of_mass_of_a_free_base(device):
 
     def end(com):
         dyn.set(body_com=com)
-        after, rates = dyn.step(q, qd, None, H, passes=4)
+        after, rates = dyn.step(q, qd, None, H, options=spo.StepOptions(passes=4))
         return (after * weights).sum() + (rates * weights[:6]).sum()
 
     given = com.clone().requires_grad_()

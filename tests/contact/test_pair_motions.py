@@ -24,7 +24,7 @@ def head_on(dtype, device, count=60, granularity=None):
     dyn = spo.Dynamics(scene, 2, device=device, dtype=dtype, granularity=granularity)
     force = np.zeros((2, 1, 3), dtype)
     for _ in range(count):
-        q, qd = dyn.step(q, qd, None, H, contact_f=force)
+        q, qd = dyn.step(q, qd, None, H, report=spo.StepReport(contact_f=force))
         met = max(met, np.abs(force).max())
     assert met > 10.0
     return before, momentum(scene, q, qd), np.linalg.norm(q[:, 7:10] - q[:, :3], axis=1)
@@ -75,7 +75,7 @@ def cage(dtype, device, count):
     before, dyn, met = momentum(scene, q, qd), spo.Dynamics(scene, 1, device=device, dtype=dtype), 0
     force = np.zeros((1, 6, 3), dtype)
     for _ in range(count):
-        q, qd = dyn.step(q, qd, None, H, contact_f=force)
+        q, qd = dyn.step(q, qd, None, H, report=spo.StepReport(contact_f=force))
         met += np.abs(force).max() > 0.0
     return before, momentum(scene, q, qd), met
 

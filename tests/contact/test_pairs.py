@@ -273,7 +273,7 @@ def test_calls_without_a_kernel_have_names(device):
         spo.Dynamics(fixed, 2, device=device, granularity="segment").step(at, np.zeros_like(at[:, 2:]), None, H)
     alone = spo.Dynamics(scene.with_contacts(scene.contacts[:1]), device=device)
     with pytest.raises(ValueError, match="contact_residual is given, and no bodies of the scene touch each other"):
-        alone.step(q, qd, None, H, contact_residual=np.zeros(1, np.float32))
+        alone.step(q, qd, None, H, report=spo.StepReport(contact_residual=np.zeros(1, np.float32)))
     assert "1 pairs of bodies" in spo.Dynamics(scene, device=device).explain()
     torch = pytest.importorskip("torch")
     with pytest.raises(ValueError, match="contact between bodies"):

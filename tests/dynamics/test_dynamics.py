@@ -273,12 +273,17 @@ def test_prepare_leaves_nothing_to_allocate(operation, device):
 def test_several_operations_are_prepared_together(device):
     """Their kernels and arrays are all there, and no call of the preparation is left waiting."""
     dyn = spo.Dynamics(scene_of("ant"), 3, device=device)
-    dyn.prepare("forward_dynamics", ("step", {"substeps": 2, "status": True}), "mass_matrix", body_f=True)
+    dyn.prepare(
+        "forward_dynamics",
+        ("step", {"options": spo.StepOptions(substeps=2), "status": True}),
+        "mass_matrix",
+        body_f=True,
+    )
     a = laws.to_device(dyn, laws.states(dyn.scene, 3))
     status, out = wp.empty(3, dtype=int, device=device), (wp.empty_like(a["q"]), wp.empty_like(a["qd"]))
     with no_warp_allocation():
         dyn.forward_dynamics(a["q"], a["qd"], a["tau"], a["body_f"], out=out[1])
-        dyn.step(a["q"], a["qd"], a["tau"], 1e-3, substeps=2, status=status, out=out)
+        dyn.step(a["q"], a["qd"], a["tau"], 1e-3, options=spo.StepOptions(substeps=2), status=status, out=out)
     assert len(dyn.programs.described()) == 3 and not status.numpy().any()
 
 

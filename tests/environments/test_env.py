@@ -42,7 +42,7 @@ def test_a_step_is_the_dynamics_and_the_terms():
         q, qd, length = env.q.clone(), env.qd.clone(), env.episode_length_buf + 1
         given = 3.0 * torch.randn(8, 1, generator=generator)
         tau = torch.cat([10.0 * given, torch.zeros(8, 1)], dim=1)
-        q, qd = dyn.step(q, qd, tau, 5e-3, substeps=4)
+        q, qd = dyn.step(q, qd, tau, 5e-3, options=spo.StepOptions(substeps=4))
         observed, reward, done, extras = env.step(given)
         expected = 0.02 * (torch.cos(q[:, 1]) - 0.1 * qd[:, 0] ** 2)
         assert torch.allclose(reward, expected, rtol=FLOAT32, atol=FLOAT32)
@@ -266,9 +266,9 @@ def test_randomised_values_are_those_of_the_dynamics():
             None,
             5e-3,
             ctrl=ctrl,
-            substeps=4,
+            options=spo.StepOptions(substeps=4),
             actuator_state=state,
-            contact_f=force,
+            report=spo.StepReport(contact_f=force),
             out=(q, qd),
         )
         observed, _, done, _ = env.step(given)

@@ -82,7 +82,9 @@ def test_they_stand(name, steps):
     q, qd, ctrl = (np.tile(x, (2, 1)) for x in (robot.q, np.zeros(robot.scene.dof_count), robot.ctrl))
     force = np.full((2, len(robot.scene.contact_points), 3), np.nan, np.float32)
     for _ in range(steps):
-        q, qd = dyn.step(q, qd, None, 5e-3, ctrl=None if name == "ant" else ctrl, contact_f=force)
+        q, qd = dyn.step(
+            q, qd, None, 5e-3, ctrl=None if name == "ant" else ctrl, report=spo.StepReport(contact_f=force)
+        )
     feet = robot.points("foot", "sole")
     weight = 9.81 * robot.scene.values["body_mass"].sum()
     share = force[:, feet, 2].sum(axis=1) / weight

@@ -173,10 +173,10 @@ def test_bodies_that_touch_each_other_are_seen_and_changed():
     dyn.set(contact_friction=friction.clone())
     q, qd = env.q.clone(), env.qd.clone()
     observed, *_ = env.step(torch.tensor([[-1.0], [0.5], [1.0]]))
-    found = {"contact_f": torch.zeros(3, 9, 3), "contact_gap": torch.zeros(3, 9), "contact_slip": torch.zeros(3, 9)}
+    found = dyn.step_report("contact_f", "contact_gap", "contact_slip", like=q)
     tau = torch.zeros(3, 7)
     tau[:, 0] = torch.tensor([-10.0, 5.0, 10.0])
-    dyn.step(q, qd, tau, env.dt, **found)
+    dyn.step(q, qd, tau, env.dt, report=found)
     for name, array in zip(("force", "gap", "slip"), found.values(), strict=True):
         np.testing.assert_allclose(observed[name].numpy(), array.flatten(1).numpy(), rtol=1e-4, atol=1e-3)
     assert (observed["force"][1:, 24] < -0.1).all()  # on the pusher

@@ -68,7 +68,7 @@ CALLS = {
     "mass": lambda dyn, q, *_: [dyn.mass_matrix(q)],
     "derivatives": lambda dyn, q, qd, tau, _: [*dyn.forward_dynamics_derivatives(q, qd, tau)],
     "step": lambda dyn, q, qd, tau, _: [*dyn.step(q, qd, tau, 2e-3)],
-    "substeps": lambda dyn, q, qd, tau, _: [*dyn.step(q, qd, tau, 2e-3, substeps=4)],
+    "substeps": lambda dyn, q, qd, tau, _: [*dyn.step(q, qd, tau, 2e-3, options=spo.StepOptions(substeps=4))],
 }
 
 

@@ -78,7 +78,7 @@ def test_energy_of_midpoint_steps_drifts_at_second_order(closed):
         state = q, np.zeros_like(q)
         before = dyn.kinetic_energy(*state) + dyn.potential_energy(state[0])
         for _ in range(round(0.1 / h)):
-            state = dyn.step(*state, None, h, integrator="midpoint")
+            state = dyn.step(*state, None, h, options=spo.StepOptions(integrator="midpoint"))
         drifts.append(np.abs(dyn.kinetic_energy(*state) + dyn.potential_energy(state[0]) - before).max())
         assert np.abs(dyn.closure_error(state[0])).max() < 1e-9
     assert drifts[1] < 0.35 * drifts[0]

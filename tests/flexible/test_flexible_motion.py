@@ -55,7 +55,7 @@ def fall(scene, seconds, dt, **options):
     dyn = spo.Dynamics(scene, 1, "cpu", "float64", **options)
     q, qd, steps, places = scene.neutral_q[None].copy(), np.zeros((1, scene.dof_count)), round(seconds / dt), []
     for step in range(1, steps + 1):
-        q, qd = dyn.step(q, qd, None, dt, integrator="midpoint")
+        q, qd = dyn.step(q, qd, None, dt, options=spo.StepOptions(integrator="midpoint"))
         if step % (steps // 10) == 0:
             places.append(dyn.body_poses(q)[0, -1, :2])
     return np.array(places)
@@ -122,7 +122,7 @@ def test_a_floating_tree_keeps_energy_and_momentum():
     energy = lambda: (traced("kinetic_energy", q=q, qd=qd) + traced("potential_energy", q=q))[0]  # noqa: E731
     first, momentum, worst = energy(), twin.momentum(q[0], qd[0]), 0.0
     for step in range(10_000):
-        q, qd = dyn.step(q, qd, None, 1e-3, integrator="midpoint")
+        q, qd = dyn.step(q, qd, None, 1e-3, options=spo.StepOptions(integrator="midpoint"))
         if step % 100 == 0:
             worst = max(worst, abs(energy() / first - 1.0))
     assert worst < 1e-6  # measured 8.5e-7, of modes of 59 rad/s

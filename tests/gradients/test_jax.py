@@ -202,7 +202,7 @@ def test_gradients_under_vmap_and_scan():
 def test_substeps():
     """One launch forward; the way back goes through each substep."""
     dyn = robot()
-    once, thrice = (spo_jax.function(dyn, "step", dt=2e-3, substeps=n) for n in (1, 3))
+    once, thrice = (spo_jax.function(dyn, "step", dt=2e-3, options=spo.StepOptions(substeps=n)) for n in (1, 3))
     q, qd, tau = arrays(dyn, "q", "qd", "tau")
 
     def chain(q, qd, tau):

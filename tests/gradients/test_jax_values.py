@@ -36,7 +36,7 @@ def test_gradients_by_values_are_those_of_torch(substeps):
     values = {name: given.pop(name) for name in VARIABLE}
     before = {name: 1.5 * dyn.recursions.parameters.value(name).numpy() for name in VARIABLE}
     dyn.set(**before)
-    step = spo_jax.function(dyn, "step", dt=H, substeps=substeps, values=VARIABLE)
+    step = spo_jax.function(dyn, "step", dt=H, options=spo.StepOptions(substeps=substeps), values=VARIABLE)
 
     @jax.jit
     def number(values, q, qd, tau, target_q):

@@ -133,9 +133,16 @@ def test_what_a_graph_fills(device):
     def run(dt):
         status, qdd, out = torch.full((WORLDS,), -1, dtype=torch.int32, device=q.device), qd * 0.0, qd * 0.0
         dyn.forward_dynamics(q, qd, status=status, out=out)
-        ahead = dyn.step(q, qd, tau, dt=dt, qdd=qdd, status=status, out=(None, out))
+        ahead = dyn.step(q, qd, tau, dt=dt, report=spo.StepReport(qdd=qdd), status=status, out=(None, out))
         frames = dyn.frame_poses(q, [(1, (0.1, 0.0, 0.2, 0.0, 0.0, 0.0, 1.0)), 0])
-        return *ahead, *dyn.step(q, qd, None, dt, integrator="midpoint"), status, qdd, out, frames
+        return (
+            *ahead,
+            *dyn.step(q, qd, None, dt, options=spo.StepOptions(integrator="midpoint")),
+            status,
+            qdd,
+            out,
+            frames,
+        )
 
     compiled = torch.compile(run, backend="aot_eager", fullgraph=True)
     for dt in (0.01, 0.02, 0.03):

@@ -163,7 +163,7 @@ def test_what_has_no_gradient_says_so(tree):
     with pytest.raises(ValueError, match=r"Dynamics.mass_matrix_inverse: body_mass was set to a tensor that"):
         dyn.mass_matrix_inverse(q)
     with pytest.raises(ValueError, match=r"expected integrator='semi_implicit'"):
-        dyn.step(q, qd, None, DT, integrator="rk4")
+        dyn.step(q, qd, None, DT, options=spo.StepOptions(integrator="rk4"))
     assert not dyn.integrate(q, qd, DT).requires_grad or "body_mass" in INTEGRATE.derivative.values
     with pytest.raises(ValueError, match=r"'joint_limit_lower' has no gradient"):
         spo_torch.Module(dyn, ["joint_limit_lower"])
@@ -180,7 +180,10 @@ BAD_OPS = {
     "no Dynamics": (lambda dyn: spo_torch.custom_op(3, "step"), "custom_op: dyn is of type int; expected a Dynamics"),
     "no option": (lambda dyn: spo_torch.custom_op(dyn, "step", dt=DT, colour=3), "colour=3 is no option; expected dt="),
     "filled": (lambda dyn: spo_torch.custom_op(dyn, "step", dt=DT, status=0), "status=0 is no option"),
-    "integrator": (lambda dyn: spo_torch.custom_op(dyn, "step", dt=DT, integrator="rk4"), "'rk4' is no option"),
+    "integrator": (
+        lambda dyn: spo_torch.custom_op(dyn, "step", dt=DT, options=spo.StepOptions(integrator="rk4")),
+        "'rk4' is no option",
+    ),
     "no dt": (lambda dyn: spo_torch.custom_op(dyn, "step"), "dt is missing; expected dt="),
     "no frames": (lambda dyn: spo_torch.custom_op(dyn, "jacobian"), "frames is missing; expected frames="),
     "too many": (lambda dyn: spo_torch.custom_op(dyn, "gravity_force")(None, None), "2 tensors .*; expected q, each"),

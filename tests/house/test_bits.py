@@ -37,7 +37,9 @@ def stepping(name, substeps):
         name,
         ("q", "qd", "tau"),
         lambda scene: (scene.dof_count,),
-        lambda subject, q, qd, tau, out: subject.dyn.step(q, qd, tau, DT, substeps=substeps, out=(None, out)),
+        lambda subject, q, qd, tau, out: subject.dyn.step(
+            q, qd, tau, DT, options=spo.StepOptions(substeps=substeps), out=(None, out)
+        ),
         lambda *_: None,
     )
 

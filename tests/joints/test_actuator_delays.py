@@ -106,7 +106,9 @@ def test_delayed_steps_are_recorded_and_repeated(device):
         for now in ctrl:
             if not often:
                 dyn._replays.forget()
-            q, qd = dyn.step(q, qd, None, 0.1, ctrl=now.clone(), actuator_state=buffers, substeps=2)
+            q, qd = dyn.step(
+                q, qd, None, 0.1, ctrl=now.clone(), actuator_state=buffers, options=spo.StepOptions(substeps=2)
+            )
         plans = [len(kind.plans) for kind in dyn._replays._kinds.values()]
         assert plans == ([1] if often else [0])
         ends.append((q, qd, *buffers))
@@ -121,7 +123,7 @@ def test_delays_count_substeps():
     once, often = (q, qd), (q, qd)
     a, b = dyn.actuator_state(like=q), dyn.actuator_state(like=torch.from_numpy(q))
     for now in ctrl:
-        once = dyn.step(*once, None, 0.1, ctrl=now, actuator_state=a, substeps=2)
+        once = dyn.step(*once, None, 0.1, ctrl=now, actuator_state=a, options=spo.StepOptions(substeps=2))
         for _ in range(2):
             often = dyn.step(*map(torch.as_tensor, often), None, 0.1, ctrl=torch.as_tensor(now), actuator_state=b)
     for x, y in zip((*once, *a), (*often, *b), strict=True):
@@ -130,13 +132,13 @@ def test_delays_count_substeps():
 
 def test_delayed_steps_allocate_nothing_and_are_captured(device):
     dyn = spo.Dynamics(LATE, 2, device=device, dtype="float64", variable=("actuator_delay",))
-    dyn.prepare("step", ctrl=True, substeps=3, status=True)
+    dyn.prepare("step", ctrl=True, options=spo.StepOptions(substeps=3), status=True)
     place = lambda *shape: wp.array(np.random.default_rng(0).normal(size=shape), dtype=wp.float64, device=device)  # noqa: E731
     q, qd, ctrl, status = place(2, 1), place(2, 1), place(2, 3), wp.zeros(2, dtype=int, device=device)
     mask = wp.array([True, False], dtype=wp.bool, device=device)
     state, twin = dyn.actuator_state(longest=3), dyn.actuator_state(q, longest=3)
     dyn.reset_actuator_state(mask, state)
-    given = dict(ctrl=ctrl, status=status, substeps=3)
+    given = dict(ctrl=ctrl, status=status, options=spo.StepOptions(substeps=3))
     out = wp.clone(q), wp.clone(qd)
     with no_warp_allocation():
         for _ in range(4):

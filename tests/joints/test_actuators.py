@@ -135,7 +135,7 @@ def test_stiff_servos_come_to_rest(hinges, device):
     dyn = spo.Dynamics(scene, 1, device=device, dtype="float64")
     q, qd, ctrl = np.array([[0.3, -0.2, 0.4]]), np.zeros((1, 3)), np.array([[0.5]])
     for _ in range(8):
-        q, qd = dyn.step(q, qd, None, 0.01, ctrl=ctrl, substeps=100)
+        q, qd = dyn.step(q, qd, None, 0.01, ctrl=ctrl, options=spo.StepOptions(substeps=100))
         assert abs(qd).max() < 100.0
     np.testing.assert_allclose(q[:, list(hinges)] @ gear, ctrl[0], atol=1e-6)
     np.testing.assert_allclose(qd, 0.0, atol=1e-2)
@@ -147,7 +147,10 @@ def test_orders_of_the_integrators(device):
     dyn = spo.Dynamics(scene, 1, device=device, dtype="float64")
     q, qd = np.array([[0.3, -0.2, 0.4]]), np.array([[0.5, -0.4, 0.3]])
     ctrl = np.array([[0.1, 0.2, 0.3, 3.0, 0.4]])
-    go = lambda rule, n: dyn.step(q, qd, None, 0.04 / n, ctrl=ctrl, integrator=rule, substeps=n)[1]  # noqa: E731
+
+    def go(rule, n):
+        return dyn.step(q, qd, None, 0.04 / n, ctrl=ctrl, options=spo.StepOptions(integrator=rule, substeps=n))[1]
+
     best = go("rk4", 64)
     for rule, order in (("semi_implicit", 1), ("midpoint", 2), ("rk4", 4)):
         coarse, fine = (abs(go(rule, n) - best).max() for n in (8, 16))
@@ -221,7 +224,7 @@ def test_gradients_of_steps():
 
     def step(q, qd, ctrl, given):
         dyn.set(actuator_strength=given)
-        return dyn.step(q, qd, None, 1e-2, ctrl=ctrl, substeps=2)
+        return dyn.step(q, qd, None, 1e-2, ctrl=ctrl, options=spo.StepOptions(substeps=2))
 
     q, qd, ctrl = states(scene, 2, seed=3)
     assert gradcheck(step, tensors(q, 0.2 * qd, ctrl, strength), atol=1e-5)

@@ -41,7 +41,7 @@ def test_a_harmonic_drive_rings_at_its_closed_form(device):
     mode = np.array([[-ARM / (MOTOR + ARM), 1.0]])  # the motor against the arm: no momentum
     q, qd = 0.01 * mode, np.zeros((1, 2))
     for _ in range(steps):
-        q, qd = dyn.step(q, qd, None, dt, integrator="rk4")
+        q, qd = dyn.step(q, qd, None, dt, options=spo.StepOptions(integrator="rk4"))
     turns = np.round(omega * dt * steps / (2.0 * np.pi))
     phase = np.arctan2(-qd[0, 1] / omega, q[0, 1])
     phase += 2.0 * np.pi * np.round((omega * dt * steps - phase) / (2.0 * np.pi))

@@ -75,14 +75,19 @@ def test_a_step_is_that_under_the_same_force(integrator, device):
     share = np.array([0.5, 1.5, -0.4])
     dyn.set(body_gravcomp=share)
     a = laws.states(plain, 3)
-    got = dyn.step(a["q"], a["qd"], a["tau"], H, integrator=integrator)
+    got = dyn.step(a["q"], a["qd"], a["tau"], H, options=spo.StepOptions(integrator=integrator))
     without = spo.Dynamics(plain, 3, device=device, dtype="float64", granularity="tree")
     body_f = np.zeros((3, 3, 6))
     body_f[..., :3] = -(share * plain.values["body_mass"][0])[:, None] * plain.values["gravity"][0]
-    wanted = without.step(a["q"], a["qd"], a["tau"], H, body_f, integrator=integrator)
+    wanted = without.step(a["q"], a["qd"], a["tau"], H, body_f=body_f, options=spo.StepOptions(integrator=integrator))
     for x, y in zip(got, wanted, strict=True):
         np.testing.assert_allclose(x, y, atol=1e-12)
-    assert np.abs(got[1] - without.step(a["q"], a["qd"], a["tau"], H, integrator=integrator)[1]).max() > 1e-3
+    assert (
+        np.abs(
+            got[1] - without.step(a["q"], a["qd"], a["tau"], H, options=spo.StepOptions(integrator=integrator))[1]
+        ).max()
+        > 1e-3
+    )
 
 
 def of_loops(name):
@@ -119,7 +124,7 @@ def test_a_step_by_limbs(device):
     a = laws.states(scene, 3)
     steps = [
         spo.Dynamics(scene, 3, device=device, dtype="float64", granularity=granularity).step(
-            a["q"], a["qd"], a["tau"], H, a["body_f"]
+            a["q"], a["qd"], a["tau"], H, body_f=a["body_f"]
         )
         for granularity in ("tree", "segment")
     ]

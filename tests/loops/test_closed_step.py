@@ -85,7 +85,9 @@ def test_multipliers_step_as_embedded_loops_do(name, device):
         dyn = spo.Dynamics(scene, 3, device=device, dtype="float64", loops=loops)
         status, qdd = np.full(3, -1, np.int32), np.full(s.qd.shape, np.nan)
         more = {name: a[name] for name in FORCES[1:]}
-        results.append((qdd, *dyn.step(a["q"], a["qd"], a["tau"], H, **more, qdd=qdd, status=status)))
+        results.append(
+            (qdd, *dyn.step(a["q"], a["qd"], a["tau"], H, **more, report=spo.StepReport(qdd=qdd), status=status))
+        )
         assert not status.any()
     assert laws.error(results[1][0], results[0][0]) <= 1e-9
     np.testing.assert_allclose(results[1][1], results[0][1], atol=SHORTEST)
@@ -114,7 +116,7 @@ def test_energy_drifts_as_its_integrator_says(integrator, order, device):
         dyn, (q, qd) = released("float64", device, 2)
         before = energy(dyn, q.numpy(), qd.numpy())
         for _ in range(round(0.5 / h)):
-            dyn.step(q, qd, None, h, integrator=integrator, out=(q, qd))
+            dyn.step(q, qd, None, h, options=spo.StepOptions(integrator=integrator), out=(q, qd))
         errors.append(np.abs(energy(dyn, q.numpy(), qd.numpy()) - before).max())
         assert np.abs(dyn.closure_error(q).numpy()).max() <= 1e-9
     assert errors[1] < 0.4 / 10**order and abs(np.log2(errors[0] / errors[1]) - order) < 0.35

@@ -64,7 +64,7 @@ def test_a_tape_differentiates_elevations(ground, passes):
         dyn.set(ground_heights=(low[:, None, None] + (high - low)[:, None, None] * unit).reshape(heights.shape))
         after, rate = q.astype(float), qd.astype(float)
         for _ in range(steps):
-            after, rate = dyn.step(after, rate, None, H, passes=passes)
+            after, rate = dyn.step(after, rate, None, H, options=spo.StepOptions(passes=passes))
         return (rate * seeds).sum()
 
     touched = np.flatnonzero(found)

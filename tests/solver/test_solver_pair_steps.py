@@ -70,7 +70,7 @@ def test_a_step_is_that_of_a_scene_by_hand():
         getattr(seen, name).fill_(np.nan)
     state.body_f, met = None, np.zeros(4, bool)
     for _ in range(60):  # with all that the solver asks for: one kernel, the same bits
-        q, qd = dyn.step(q, qd, np.zeros_like(qd), H, status=status, **reports)
+        q, qd = dyn.step(q, qd, np.zeros_like(qd), H, status=status, report=spo.StepReport(**reports))
         run(solver, state, 1, observables=seen)
         for name in ("contact_f", "contact_slip", "contact_residual"):
             np.testing.assert_array_equal(getattr(seen, name).numpy(), reports[name])
@@ -107,7 +107,7 @@ def test_impulses_are_equal_and_opposite(dtype):
         scene, force = dyn.scene, np.zeros((2, 1, 3))
         dyn = spo.Dynamics(scene, 2, dtype="float64")
         for _ in range(60):
-            q, qd = dyn.step(q, qd, None, H, contact_f=force)
+            q, qd = dyn.step(q, qd, None, H, report=spo.StepReport(contact_f=force))
             met = max(met, np.abs(force).max())
         mass = np.broadcast_to(scene.values["body_mass"], (2, 2))[..., None]
     after = (mass * qd.reshape(2, 2, 6)[:, :, :3]).sum(axis=1)
@@ -283,7 +283,7 @@ def test_a_step_of_the_gripper_is_that_of_the_librarys_own_scene():
     seen.contact_f.fill_(np.nan)
     for _ in range(3):
         target = np.float32(control.joint_target_q.numpy().reshape(2, -1))
-        q, qd = dyn.step(q, qd, tau, H, target_q=target, contact_f=force)
+        q, qd = dyn.step(q, qd, tau, H, target_q=target, report=spo.StepReport(contact_f=force))
         solver.step(state, state, control, None, H, observables=seen)
         np.testing.assert_allclose(state.joint_qd.numpy().reshape(2, -1), qd, atol=EQUAL * max(1.0, np.abs(qd).max()))
         np.testing.assert_allclose(seen.contact_f.numpy(), force, atol=1e-3 * np.abs(force).max())

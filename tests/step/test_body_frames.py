@@ -55,7 +55,7 @@ def test_equal_those_of_statements(name, variable, device):
         alone.set(body_com=com)
     a = states(scene, WORLDS)
     bodies = {n: np.full((WORLDS, scene.body_count, k), np.nan) for n, k in SIZES.items()}
-    after = dyn.step(a["q"], a["qd"], a["tau"], H, *(a[name] for name in FORCES[1:]), **bodies)
+    after = dyn.step(a["q"], a["qd"], a["tau"], H, **{n: a[n] for n in FORCES[1:]}, report=spo.StepReport(**bodies))
     for got, wanted in zip(bodies.values(), alone.body_states(*after), strict=True):
         np.testing.assert_allclose(got, wanted, rtol=0.0, atol=ROUNDING)
     assert sum("body_states" in line for line in dyn.programs.described()) == 1
@@ -85,10 +85,10 @@ def test_a_world_does_not_depend_on_their_number(dtype, device):
     a = states(scene, count, dtype)
     for worlds in (count, 1, 31, 32, *((1000, 4096, 16384, 65536) if device.is_cuda else ())):
         dyn = spo.Dynamics(scene, worlds, device=device, dtype=dtype, granularity="segment")
-        rows = {name: np.resize(a[name], (worlds, *a[name].shape[1:])) for name in ("q", "qd", "tau", *FORCES[1:])}
-        given = [wp.array(each, dtype=dyn.dtype, device=device) for each in rows.values()]
+        rows = {name: np.resize(a[name], (worlds, *a[name].shape[1:])) for name in ("q", "qd", *FORCES)}
+        given = {name: wp.array(each, dtype=dyn.dtype, device=device) for name, each in rows.items()}
         bodies = {n: wp.full((worlds, scene.body_count, k), np.nan, dyn.dtype, device) for n, k in SIZES.items()}
-        after = dyn.step(*given[:3], H, *given[3:], **bodies)
+        after = dyn.step(**given, dt=H, report=spo.StepReport(**bodies))
         found[worlds] = [array.numpy() for array in (*after, *bodies.values())]
         for one, more in zip(found[worlds], found[count], strict=True):
             assert np.isfinite(one).all()

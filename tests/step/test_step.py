@@ -32,7 +32,7 @@ def test_equals_the_dense_nonlinear_equation(name, dtype, device):
     on = laws.to_device(dyn, a)
     status = wp.full(worlds, -1, dtype=wp.int32, device=device)
     out = tuple(wp.full(x.shape, float("nan"), dtype=dyn.dtype, device=device) for x in (on["q"], on["qd"]))
-    assert dyn.step(on["q"], on["qd"], on["tau"], H, *(on[n] for n in FORCES[1:]), status=status, out=out) == out
+    assert dyn.step(on["q"], on["qd"], on["tau"], H, **{n: on[n] for n in FORCES[1:]}, status=status, out=out) == out
     assert not status.numpy().any()
     q, qd = (array.numpy().astype(np.float64) for array in out)
     for w in range(worlds):
@@ -175,7 +175,7 @@ def test_integrators_converge_at_their_order_to_one_solution(integrator, order, 
         q, qd = (wp.array(a[name], dtype=wp.float64, device=device) for name in ("q", "qd"))
         tau = wp.array(0.1 * a["tau"], dtype=wp.float64, device=device)
         for _ in range(count):
-            dyn.step(q, qd, tau, 0.1 / count, integrator=integrator, out=(q, qd))
+            dyn.step(q, qd, tau, 0.1 / count, options=spo.StepOptions(integrator=integrator), out=(q, qd))
         q = laws.same_quaternion_sign("integrate", scene, q.numpy()[0], exact[0] if exact else q.numpy()[0])
         return q, qd.numpy()[0]
 
@@ -191,7 +191,9 @@ def test_midpoint_bears_stiff_springs(device):
     dyn = spo.Dynamics(scene, 1, device=device, dtype="float64")
     q, qd = np.array([[1.0]]), np.array([[0.0]])
     for _ in range(2000):
-        q, qd = dyn.step(q, qd, None, H, integrator="midpoint")
+        q, qd = dyn.step(q, qd, None, H, options=spo.StepOptions(integrator="midpoint"))
     assert abs(q[0, 0]) < 1.0
     with pytest.raises(UnsupportedError, match="friction or velocity limits"):
-        spo.Dynamics(slider(friction=1.0), 1, device=device).step(q, qd, None, H, integrator="rk4")
+        spo.Dynamics(slider(friction=1.0), 1, device=device).step(
+            q, qd, None, H, options=spo.StepOptions(integrator="rk4")
+        )

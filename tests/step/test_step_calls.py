@@ -10,6 +10,7 @@ import warp as wp
 import warp_spo as spo
 from support import laws, symbolic, zoo
 from support.allocations import no_warp_allocation
+from support.step_calls import bundled
 from support.step_scenes import FORCES, H, furnished, slider, states
 from warp_spo.errors import UnsupportedError
 from warp_spo.kernels import native, pass_loops
@@ -23,8 +24,8 @@ def test_in_place_and_without_allocation(device):
     dyn.prepare("step", target_q=True, target_qd=True, body_f=True)
     out = [wp.empty_like(on[name]) for name in ("q", "qd")]
     with no_warp_allocation():
-        dyn.step(on["q"], on["qd"], on["tau"], H, *(on[n] for n in FORCES[1:]), out=out)
-        dyn.step(on["q"], on["qd"], on["tau"], H, *(on[n] for n in FORCES[1:]), out=(on["q"], on["qd"]))
+        dyn.step(on["q"], on["qd"], on["tau"], H, **{n: on[n] for n in FORCES[1:]}, out=out)
+        dyn.step(on["q"], on["qd"], on["tau"], H, **{n: on[n] for n in FORCES[1:]}, out=(on["q"], on["qd"]))
     for array, name in zip(out, ("q", "qd"), strict=True):
         np.testing.assert_array_equal(array.numpy(), on[name].numpy())
     with pytest.raises(ValueError, match="overlaps"):
@@ -45,21 +46,21 @@ def test_states_of_bodies(granularity, device):
     scene, worlds = furnished(zoo.fork()), 3
     dyn = spo.Dynamics(scene, worlds, device=device, granularity=granularity)
     on = laws.to_device(dyn, states(scene, worlds, "float32"))
-    given = on["q"], on["qd"], on["tau"], H, *(on[n] for n in FORCES[1:])
+    given = {n: on[n] for n in ("q", "qd", *FORCES)} | {"dt": H}
     sizes = dict(poses=7, velocities=6)
     word = dict(status=wp.empty(worlds, dtype=wp.int32, device=device))
     for more in (word, dict(substeps=2), *([dict(integrator="midpoint")] if granularity == "tree" else [])):
-        alone = dyn.step(*given, **more)
+        alone = dyn.step(**given, **bundled(**more))
         expected = dict(zip(sizes, dyn.body_states(*alone), strict=True))
         for names in (("poses", "velocities"), ("velocities",)):
             bodies = {n: wp.full((worlds, scene.body_count, sizes[n]), np.nan, dyn.dtype, device) for n in names}
-            after = dyn.step(*given, **more, **bodies)
+            after = dyn.step(**given, **bundled(**more, **bodies))
             for got, wanted in zip(after, alone, strict=True):
                 np.testing.assert_array_equal(got.numpy(), wanted.numpy())
             for name, got in bodies.items():
                 np.testing.assert_allclose(got.numpy(), expected[name].numpy(), rtol=0.0, atol=1e-5)
     with pytest.raises(ValueError, match=r"velocities .* expected \(3, 5, 6\) \[world, body, 6\]"):
-        dyn.step(*given, velocities=np.zeros((3, 5, 7), np.float32))
+        dyn.step(**given, report=spo.StepReport(velocities=np.zeros((3, 5, 7), np.float32)))
 
 
 def test_a_step_in_place_reads_its_state_once(device, monkeypatch):
@@ -96,7 +97,7 @@ def test_values_that_are_variable_or_differ_between_worlds(device):
     dyn = spo.Dynamics(various, worlds, device=device, dtype="float64", variable=names)
     dyn.set(**values)
     a = states(scene, worlds)
-    got = dyn.step(a["q"], a["qd"], a["tau"], H, *(a[n] for n in FORCES[1:]))
+    got = dyn.step(a["q"], a["qd"], a["tau"], H, **{n: a[n] for n in FORCES[1:]})
     for w in range(worlds):
         one = scene.with_values(joint_limit_lower=lower[w], **{name: array[w] for name, array in values.items()})
         folded = symbolic.advance(one, {name: array[w : w + 1] for name, array in a.items()}, H)
@@ -127,7 +128,7 @@ def test_further_results_are_asked_for_one_by_one(device):
     for asked in (("status",), ("qdd",), ("qdd", "status")):
         given = {"status": np.full(2, -1, np.int32), "qdd": np.full(a["qd"].shape, np.nan)}
         given = {name: given[name] for name in asked}
-        for x, y in zip(dyn.step(a["q"], a["qd"], a["tau"], H, **given), plain, strict=True):
+        for x, y in zip(dyn.step(a["q"], a["qd"], a["tau"], H, **bundled(**given)), plain, strict=True):
             np.testing.assert_allclose(x, y, atol=1e-14)
         if "status" in asked:
             assert not given["status"].any()
@@ -138,7 +139,7 @@ def test_further_results_are_asked_for_one_by_one(device):
 def test_mistakes_are_explained(device):
     dyn = spo.Dynamics(zoo.fork(), 2, device=device)
     a = states(dyn.scene, 2)
-    call = lambda **more: dyn.step(**{"q": a["q"], "qd": a["qd"], "tau": None, "dt": H, **more})  # noqa: E731
+    call = lambda **more: dyn.step(**{"q": a["q"], "qd": a["qd"], "tau": None, "dt": H, **bundled(**more)})  # noqa: E731
     with pytest.raises(TypeError, match=r"Dynamics.step: dt is 'soon'; expected a number of seconds"):
         call(dt="soon")
     with pytest.raises(TypeError, match=r"Dynamics.step: dt is array\(\[0.002\]\); expected a number of seconds"):

@@ -12,12 +12,13 @@ from support import actuated, implicit, laws, symbolic, warp_machine, zoo
 from support.granularity_scenes import MANY, hand
 from support.quick import slow_unless
 from support.routines import ROUTINES
+from support.step_calls import bundled
 from support.step_scenes import FORCES, TOLERANCE, H, furnished, states
 from warp_spo.execution import plan
-from warp_spo.execution.segment import programs as segment_programs
 from warp_spo.execution.segment import warp_specialized
 from warp_spo.kernels import pass_loops, straight_line
 from warp_spo.kernels.substeps import repeat_on_cuda
+from warp_spo.recursions.step import step as steps
 from warp_spo.recursions.step.step import MOST_JOINT_SPACE_DOFS, Step, by_segments
 
 WORLDS = 4
@@ -40,7 +41,7 @@ def scene_of(name):
 
 
 def step(dyn, a, **more):
-    return dyn.step(a["q"], a["qd"], a["tau"], H, *(a[name] for name in FORCES[1:]), **more)
+    return dyn.step(a["q"], a["qd"], a["tau"], H, **{n: a[n] for n in FORCES[1:]}, **bundled(**more))
 
 
 @pytest.mark.parametrize(

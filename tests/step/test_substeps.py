@@ -11,6 +11,7 @@ from support import zoo
 from support.actuated import CURVES, KINDS, arm, states
 from support.allocations import no_warp_allocation
 from support.mechanisms import MECHANISMS
+from support.step_calls import bundled
 from support.step_scenes import furnished
 from support.step_scenes import states as step_states
 from warp_spo.execution import plan
@@ -25,7 +26,7 @@ def in_calls(dyn, q, qd, tau, **given):
     for _ in range(COUNT):
         if "status" in given:
             given["status"] = np.full(dyn.worlds, -1, np.int32)
-        q, qd = dyn.step(q, qd, tau, H, **given)
+        q, qd = dyn.step(q, qd, tau, H, **bundled(**given))
         words.append(given.get("status"))
     return (q, qd), words
 
@@ -40,16 +41,15 @@ def test_bits_are_those_of_calls(integrator, device):
     wanted, _ = in_calls(dyn, q, qd, tau, **given)
     more = {} if integrator != "semi_implicit" else {"qdd": qdd}
     before = q.copy(), qd.copy()
-    out = dyn.step(q, qd, tau, H, substeps=COUNT, **given, **more)
+    out = dyn.step(q, qd, tau, H, **bundled(substeps=COUNT, **given, **more))
     np.testing.assert_array_equal((q, qd), before)
     np.testing.assert_array_equal(out, wanted)
-    assert dyn.step(q, qd, tau, H, substeps=COUNT, out=(q, qd), **given)[0] is q
+    assert dyn.step(q, qd, tau, H, out=(q, qd), **bundled(substeps=COUNT, **given))[0] is q
     np.testing.assert_array_equal((q, qd), wanted)
     if more:
-        last = dyn.step(
-            *dyn.step(*before, tau, H, substeps=COUNT - 1, **given), tau, H, qdd=np.empty_like(qdd), **given
-        )
-        np.testing.assert_allclose(qdd, (last[1] - dyn.step(*before, tau, H, substeps=2, **given)[1]) / H, atol=1e-9)
+        earlier = dyn.step(*before, tau, H, **bundled(substeps=COUNT - 1, **given))
+        last = dyn.step(*earlier, tau, H, **bundled(qdd=np.empty_like(qdd), **given))
+        np.testing.assert_allclose(qdd, (last[1] - earlier[1]) / H, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_one_launch_takes_them_all(granularity, dtype, device):
     given |= {"status": word, "qdd": qdd}
     for count in (2, COUNT, COUNT):
         with record_launches() as launched:
-            found = dyn.step(a["q"], a["qd"], a["tau"], H, substeps=count, **given)
+            found = dyn.step(a["q"], a["qd"], a["tau"], H, **bundled(substeps=count, **given))
     assert len(launched) == len(dyn.programs.described()) == 1
     wanted, words = in_calls(dyn, a["q"], a["qd"], a["tau"], **(given | {"qdd": (last := np.full_like(qdd, np.nan))}))
     for x, y in zip((*found, qdd), (*wanted, last), strict=True):
@@ -75,7 +75,7 @@ def test_one_launch_takes_them_all(granularity, dtype, device):
     severity = np.array([spo.Status(one).severity for one in range(len(spo.Status))])
     np.testing.assert_array_equal(severity[word], np.max(severity[np.array(words)], axis=0))
     assert word[1] == word[2] == spo.Status.NOT_FINITE and np.isfinite(np.delete(wanted[1], (1, 2), 0)).all()
-    dyn.step(a["q"], a["qd"], a["tau"], H, substeps=COUNT, **given, out=(a["q"], a["qd"]))
+    dyn.step(a["q"], a["qd"], a["tau"], H, **bundled(substeps=COUNT, **given), out=(a["q"], a["qd"]))
     np.testing.assert_array_equal(a["q"], wanted[0])
     np.testing.assert_array_equal(a["qd"], wanted[1])
 
@@ -107,7 +107,7 @@ def test_bits_are_those_of_calls_with_closed_loops(loops, device):
     q, qd = dyn.project(np.tile(scene.neutral_q, (2, 1)), rng.normal(size=(2, scene.dof_count)))
     status = np.full(2, -1, np.int32)
     wanted, words = in_calls(dyn, q, qd, None, status=status)
-    out = dyn.step(q, qd, None, H, substeps=COUNT, status=status)
+    out = dyn.step(q, qd, None, H, options=spo.StepOptions(substeps=COUNT), status=status)
     for x, y in zip(out, wanted, strict=True):
         np.testing.assert_array_equal(x, y)
     np.testing.assert_array_equal(status, np.max(words, axis=0))
@@ -130,7 +130,7 @@ def test_status_is_the_worst(device):
     rest = np.zeros((3, 1))
     word = np.full(3, -1, np.int32)
     tau = np.array([[0.0], [1e308], [np.nan]])
-    dyn.step(rest, rest, tau, 10.0, substeps=5, status=word)
+    dyn.step(rest, rest, tau, 10.0, options=spo.StepOptions(substeps=5), status=word)
     np.testing.assert_array_equal(word, [0, 1, 2])  # infinite after some substeps: not for an infinite input
 
 
@@ -145,7 +145,7 @@ def test_gradients_are_those_of_calls():
             for _ in range(COUNT):
                 after = dyn.step(*after, None, H, ctrl=ctrl)
         else:
-            after = dyn.step(q, qd, None, H, ctrl=ctrl, substeps=COUNT)
+            after = dyn.step(q, qd, None, H, ctrl=ctrl, options=spo.StepOptions(substeps=COUNT))
         (after[0].square().sum() + after[1].sum()).backward()
         found.append([*(x.detach() for x in after), q.grad, qd.grad, ctrl.grad])
     for x, y in zip(*found, strict=True):
@@ -158,30 +158,30 @@ def test_refusals():
     zeros = np.zeros((1, 3), np.float32)
     for count in (0, 1.5, True, "2"):
         with pytest.raises(ValueError, match=r"Dynamics.step: substeps is .*; expected an integer, 1 or more"):
-            dyn.step(zeros, zeros, None, H, substeps=count)
+            dyn.step(zeros, zeros, None, H, options=spo.StepOptions(substeps=count))
     grad = torch.zeros((1, 3), requires_grad=True)
     with pytest.raises(ValueError, match="substeps is 0; expected an integer"):
-        dyn.step(grad, grad, None, H, substeps=0)
+        dyn.step(grad, grad, None, H, options=spo.StepOptions(substeps=0))
     with pytest.raises(ValueError, match="status is given with substeps and an input requires grad"):
-        dyn.step(grad, grad, None, H, substeps=2, status=torch.zeros(1, dtype=torch.int32))
+        dyn.step(grad, grad, None, H, options=spo.StepOptions(substeps=2), status=torch.zeros(1, dtype=torch.int32))
     with pytest.raises(TypeError, match="substeps=2 is no option"):
         from warp_spo import torch as spo_torch
 
-        spo_torch.custom_op(dyn, "step", dt=H, substeps=2)
+        spo_torch.custom_op(dyn, "step", dt=H, options=spo.StepOptions(substeps=2))
 
 
 def test_nothing_is_allocated_and_a_graph_repeats_it(device):
     scene = zoo.fork()
     dyn = spo.Dynamics(scene, 2, device=device)
-    dyn.prepare("step", status=True, substeps=COUNT)
+    dyn.prepare("step", status=True, options=spo.StepOptions(substeps=COUNT))
     q, qd, tau = (wp.array(array, dtype=wp.float32, device=device) for array in zoo.random_state(scene, 2))
     status = wp.empty(2, dtype=int, device=device)
     out = wp.empty_like(q), wp.empty_like(qd)
     with no_warp_allocation():
-        dyn.step(q, qd, tau, H, substeps=COUNT, status=status, out=out)
+        dyn.step(q, qd, tau, H, options=spo.StepOptions(substeps=COUNT), status=status, out=out)
     again = wp.empty_like(q), wp.empty_like(qd)
     with wp.ScopedCapture(device) as capture:
-        dyn.step(q, qd, tau, H, substeps=COUNT, status=status, out=again)
+        dyn.step(q, qd, tau, H, options=spo.StepOptions(substeps=COUNT), status=status, out=again)
     for array in again:
         array.fill_(np.nan)
     wp.capture_launch(capture.graph)
@@ -195,8 +195,8 @@ def test_substeps_and_controls_in_a_graph_of_torch():
     dyn = spo.Dynamics(arm([KINDS["position"][0]]), 2, device="cpu", dtype="float64")
     q, qd, ctrl = (torch.as_tensor(array) for array in states(dyn.scene, 2))
     step = lambda q, qd, ctrl, **more: dyn.step(q, qd, None, H, ctrl=ctrl, **more)  # noqa: E731
-    compiled = torch.compile(step, backend="eager", fullgraph=True)
-    for x, y in zip(compiled(q, qd, ctrl, substeps=COUNT), step(q, qd, ctrl, substeps=COUNT), strict=True):
+    compiled, often = torch.compile(step, backend="eager", fullgraph=True), spo.StepOptions(substeps=COUNT)
+    for x, y in zip(compiled(q, qd, ctrl, options=often), step(q, qd, ctrl, options=often), strict=True):
         assert torch.equal(x, y)
     gradients = []
     for call in (compiled, step):

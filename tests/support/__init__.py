@@ -7,7 +7,8 @@ Scenes:
 Joints and what drives them:
     ``custom_hinges``, ``hinge_twins`` (one mechanism written in two ways), ``geared``, ``actuated``.
 Steps:
-    ``step_scenes``, ``implicit`` (the dense nonlinear equation), ``rollouts``.
+    ``step_scenes``, ``step_calls`` (options and reports by name), ``implicit`` (the dense nonlinear equation),
+    ``rollouts``.
 Contact with the ground:
     ``contact_cases``, ``contact_steps`` (the comparison with the dense step), ``contact_gradients``, ``hopping_leg``.
 Contact between bodies:

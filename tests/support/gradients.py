@@ -65,7 +65,7 @@ OPERATIONS = {
 def called(dyn, operation, *args):
     if operation == "step":
         q, qd, tau, *more = args
-        return dyn.step(q, qd, tau, DT, *more)
+        return dyn.step(q, qd, tau, DT, **dict(zip(OPERATIONS["step"][3:], more, strict=False)))
     return getattr(dyn, operation)(*args, **options(operation))
 
 

@@ -6,6 +6,8 @@ import pytest
 import warp_spo as spo
 from warp_spo.examples import hop
 
+from .step_calls import bundled
+
 torch = pytest.importorskip("torch")
 H, WORLDS = 5e-3, 4
 VARIABLE = ("body_mass", "joint_friction", "joint_target_ke", "contact_friction", "contact_stiffness")
@@ -26,5 +28,5 @@ def leg(dtype, device):
 def loss(dyn, tensors, **more):
     """A number of each world after a step."""
     dyn.set(**{name: tensors[name] for name in VARIABLE})
-    q, qd = dyn.step(tensors["q"], tensors["qd"], tensors["tau"], H, target_q=tensors["target_q"], **more)
+    q, qd = dyn.step(tensors["q"], tensors["qd"], tensors["tau"], H, target_q=tensors["target_q"], **bundled(**more))
     return (q * q).sum(1) + (qd * qd).sum(1)

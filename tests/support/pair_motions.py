@@ -28,7 +28,7 @@ def stand(scene, q, settle, seconds, device, dtype="float64"):
         0,
     )
     for i in range(round((settle + seconds) / H)):
-        q, qd = dyn.step(q, qd, None, H, contact_f=force)
+        q, qd = dyn.step(q, qd, None, H, report=spo.StepReport(contact_f=force))
         if i == round(settle / H):
             first = q
         if i > settle / H:
@@ -44,7 +44,7 @@ def largest_rise(scene, q, qd, device, h=H):
     gap, energy = np.zeros((worlds, scene.contact_count)), dyn.kinetic_energy(q, qd)
     force = np.zeros((*gap.shape, 3))
     for _ in range(round(0.6 / h)):
-        q, qd = dyn.step(q, qd, None, h, contact_gap=gap, contact_f=force)
+        q, qd = dyn.step(q, qd, None, h, report=spo.StepReport(contact_gap=gap, contact_f=force))
         depth = np.maximum(-gap[:, len(scene.contact_points) :], 0.0)  # before the step
         found.append(energy + 0.5 * depth**2 @ k)
         energy, met = dyn.kinetic_energy(q, qd), met | force.any(axis=(1, 2))

@@ -7,6 +7,7 @@ from warp_spo.reference.body_contact import faces
 from warp_spo.reference.rotations import homogeneous
 
 from .contact_cases import solid
+from .step_calls import bundled
 
 H = 5e-3
 WEDGE = np.array([[x, y, z] for y in (-0.1, 0.1) for x, z in ((-0.15, 0.0), (0.12, 0.0), (0.12, 0.1))])  # 20 degrees
@@ -218,5 +219,5 @@ def stepped(dyn, q, qd, **more):
     found = {"contact_f": np.full((worlds, count, 3), np.nan, dtype)}
     found |= {name: np.full((worlds, count), np.nan, dtype) for name in ("contact_gap", "contact_slip")}
     found |= {"contact_excess": np.full((worlds, 3), np.nan, dtype), "status": np.full(worlds, -1, np.int32)}
-    found["q"], found["qd"] = dyn.step(q.astype(dtype), qd.astype(dtype), None, H, **found, **more)
+    found["q"], found["qd"] = dyn.step(q.astype(dtype), qd.astype(dtype), None, H, **bundled(**found, **more))
     return found

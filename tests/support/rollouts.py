@@ -5,16 +5,19 @@ import math
 import numpy as np
 import warp as wp
 
+import warp_spo as spo
+
 
 def rollout(dyn, q, qd, h, steps, integrator="semi_implicit", tau=None):
     """q, qd [world, ...] after so many steps."""
     state = [wp.array(x, dtype=dyn.dtype, device=dyn.device) for x in (q, qd)]
     tau = None if tau is None else wp.array(tau, dtype=dyn.dtype, device=dyn.device)
-    dyn.prepare("step", integrator=integrator)
+    options = spo.StepOptions(integrator=integrator)
+    dyn.prepare("step", options=options)
     piece = math.gcd(steps, 1000)
     with wp.ScopedCapture(dyn.device) as capture:
         for _ in range(piece):
-            dyn.step(*state, tau, h, integrator=integrator, out=tuple(state))
+            dyn.step(*state, tau, h, options=options, out=tuple(state))
     for _ in range(steps // piece):
         wp.capture_launch(capture.graph)
     return tuple(x.numpy().astype(float) for x in state)

@@ -137,7 +137,7 @@ def check_commands(dyn: Dynamics, call: Call, ctrl: Any, state: Any, target_q: A
             warnings.warn(
                 f"{call.name}: target_q moves nothing, because joint_target_ke of the scene is zero; set gains by "
                 "scene.with_values(joint_target_ke=..., joint_target_kd=...); files of robots rarely have them",
-                stacklevel=6,
+                stacklevel=7,
             )
     if ctrl is None and state is not None:
         raise ValueError(f"{call.name}: actuator_state is given and ctrl is None; expected both, or neither")

@@ -14,15 +14,20 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
 from ..runtime.arrays import CLASSES, TORCH, torch_border
+from ..runtime.autograd import call_in_graph, call_with_gradient, is_exported, is_traced, records_gradient
 from ..runtime.call_order import CallOrder
+from ..runtime.dlpack import settle
 from ..runtime.launches import Recording
 from ..runtime.launches import recording as open_recording
 from ..runtime.memory import ranges_overlap, size_in_bytes
+
+if TYPE_CHECKING:
+    from .operation import Operation
 
 Builder = Callable[[Sequence[Any], list], Any]
 """``build(arrays, results)`` returns what a caller gets, of the arrays of the call and those that it made."""
@@ -30,6 +35,37 @@ MOST_KINDS, MOST_TRIES = 256, 4  # kinds of calls that are kept; calls of a kind
 NUMBERS = frozenset((int, float, bool, str))
 MISS = object()
 """Returned by :meth:`Replays.replay` if nothing was recorded for the call."""
+
+
+def dispatch(operation: Operation, dyn: Any, args: tuple, more: dict[str, Any]) -> Any:
+    """Return the result of a call of an operation by users.
+
+    In this order: torch traces the call as a node of its graph; a recorded call is repeated, with torch's gradients or
+    without; torch's autograd records the call; the method runs.
+    """
+    graphed = operation.graphed
+    if graphed is not None and is_traced():
+        return call_in_graph(dyn._handle, *graphed, args, more)
+    again = dyn._gradients.latest.get(operation.name)
+    if again is not None:
+        result = again(args, more)
+        if result is not MISS:
+            return result
+    key, arrays = None, []
+    if not dyn.values.tensors or not records_gradient((), dyn.values):
+        result, key, arrays = dyn._replays.replay(operation.name, args, more)
+        if result is not MISS:
+            return result
+    if graphed is not None and is_exported():
+        return call_in_graph(dyn._handle, *graphed, args, more)
+    if operation.derivative is not None and records_gradient((*args, *more.values()), dyn.values):
+        names = operation.parameters
+        arguments = dict(zip(names, args, strict=False)) | more
+        if len(arguments) < len(args) + len(more) or not arguments.keys() <= names.keys():
+            operation.signature.bind(dyn, *args, **more)  # raises TypeError
+        return call_with_gradient(dyn, operation, arguments, (args, more))
+    settle((*args, *more.values()))
+    return dyn._replays.run(key, arrays, lambda: operation.function(dyn, *args, **more))
 
 
 Repeat = Callable[[Sequence[Any]], Any]

@@ -174,6 +174,7 @@ class Dynamics:
     # -- steps -----------------------------------------------------------------------------------------------------
     integrate = steps.integrate
     step = steps.step
+    step_report = steps.step_report
 
     # -- configurations --------------------------------------------------------------------------------------------
     difference = configurations.difference

@@ -26,6 +26,9 @@ An :class:`Operation` stands right above the method that it declares::
 and ``mass_matrix = inertia.mass_matrix`` is its line in the class. Checks of arguments, refusals with closed loops,
 ``prepare``, gradients in torch, trials, the main job's table and the benchmarks read the declaration.
 
+An operation of many arguments has ``bundles``: objects that hold some of them. Its method takes all by their own names
+and is called ``_step``, and ``@STEP.public`` stands above the signature that users see.
+
 Axes are written as words: "world, dof". The words are "world", "coordinate", "dof", "independent dof" (the dofs that
 move all others where loops are embedded, otherwise all dofs), "body", "frame", "6 frames" (six for each frame), "10
 bodies", "row" (of the closures of loops), "actuator", "contact" (each point), "entry" (of a packed matrix), and
@@ -37,8 +40,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, cast
 
 import numpy as np
 import warp as wp
@@ -46,18 +49,17 @@ import warp as wp
 from ..execution.routine import Routine
 from ..recursions.model.links import LINK_VALUES, MOTION_VALUES, Links
 from ..runtime.arrays import Call
-from ..runtime.autograd import call_in_graph, call_with_gradient, is_exported, is_traced, records_gradient
 from ..runtime.dlpack import settle
 from ..scene.contact_values import CONTACT_VALUES
 from ..scene.frames import check_frames, origins
 from ..scene.ground import HEIGHTS
 from ..scene.scene import Scene
 from . import trial_inputs
-from .call_replay import MISS
+from .call_replay import MISS, dispatch
 
 if TYPE_CHECKING:
     from .gradients import Pull
-from ..errors import is_bool
+from ..errors import as_names, is_bool
 from ..runtime.autograd import check_plain
 from ..scene.parts import real
 
@@ -131,6 +133,44 @@ class Result:
     like: str = ""
     over: str = ""
     quaternions: Callable[[Scene], list[int]] = lambda scene: []
+
+
+@dataclasses.dataclass(frozen=True)
+class Bundle:
+    """Arguments that callers pass in one object.
+
+    Attributes:
+        name: of the argument that takes the object. members: names of the arguments in it.
+        expand: ``expand(call, value)`` returns the members of an object by name, those that differ from their defaults.
+        form: how a caller passes a member, for errors; ``{name}`` stands for its name.
+        written: the members are arrays that the call fills; ``prepare`` takes their names.
+    """
+
+    name: str
+    members: tuple[str, ...]
+    expand: Callable[[str, Any], dict[str, Any]]
+    form: str
+    written: bool = False
+
+    def ask(self, call: str, value: Any) -> dict[str, Any]:
+        """Return the members by name that ``prepare`` passes; arrays that the call fills are named, and True.
+
+        Raises:
+            TypeError: the value is not such an object, or such names. ValueError: there is no such array.
+        """
+        if not self.written:
+            return self.expand(call, value)
+        names = as_names(call, self.name, value, self.members[-1:])
+        for name in names:
+            if name not in self.members:
+                known = ", ".join(self.members)
+                raise ValueError(f"{call}: {self.name} names {name!r}; expected some of {known}")
+        return dict.fromkeys(names, True)
+
+    def refuse(self, call: str, name: str, asked: bool = False) -> NoReturn:
+        """Raise TypeError for a member that is given by itself; ``asked``: to ``prepare``."""
+        form = f'{self.name}=("{name}",)' if asked and self.written else self.form.format(name=name)
+        raise TypeError(f"{call}: {name}= is no argument; expected {form}")
 
 
 def required(argument: Argument) -> Argument:
@@ -281,6 +321,9 @@ class Operation:
         derivative: its way back; None: torch gets no gradients.
         trial: how it is compared with the dense reference.
         product: it is itself a product with a Jacobian, of another operation.
+        bundles: arguments that callers pass in objects.
+        graphed: what a graph of torch needs of the operation, see :func:`warp_spo.torch.call_in_graph`; None: it
+            returns objects that a graph does not know.
     """
 
     name: str
@@ -294,50 +337,104 @@ class Operation:
     derivative: Derivative | None = None
     trial: Trial | None = None
     product: bool = False
+    bundles: tuple[Bundle, ...] = ()
+    graphed: tuple[Any, ...] | None = dataclasses.field(default=None, init=False, repr=False)
     _methods: list[Callable[..., Any]] = dataclasses.field(default_factory=list, repr=False)
 
     def method(self, function: MethodT) -> MethodT:
-        """Declare ``function`` to be the method of this operation.
+        """Declare ``function`` to be the method of this operation, which takes all its arguments by name.
 
-        Calls are recorded and repeated, see :mod:`.replays`, and torch gets the operation's gradients if it has any.
+        :func:`.call_replay.dispatch` repeats recorded calls, and gives torch the gradients of the operation.
         """
-        assert function.__name__ == self.name, f"{function.__name__} is declared as {self.name}"
+        expected = f"_{self.name}" if self.bundles else self.name
+        assert function.__name__ == expected, f"{function.__name__} is declared as {self.name}"
         vars(function)["operation"] = self
         self._methods.append(function)
-        signature, name = inspect.signature(function), self.name
-        names = dict(list(signature.parameters.items())[1:])
-        written = tuple(one.name for one in self.arrays if one.written)
-        keeps = () if self.derivative is None else self.derivative.keeps
-        graphed = name, tuple(names), len(self.results), keeps, written
         returns = str(function.__annotations__.get("return", ""))
-        in_graph = returns.startswith(("ArrayT", "tuple[ArrayT"))  # others make objects, which a graph does not know
+        if returns.startswith(("ArrayT", "tuple[ArrayT")):
+            written = tuple(one.name for one in self.arrays if one.written)
+            keeps = () if self.derivative is None else self.derivative.keeps
+            graphed = self.name, tuple(self.parameters), len(self.results), keeps, written
+            object.__setattr__(self, "graphed", graphed)
 
         @functools.wraps(function)
         def call(dyn: Any, *args: Any, **more: Any) -> Any:
-            if is_traced() and in_graph:
-                return call_in_graph(dyn._handle, *graphed, args, more)
-            again = dyn._gradients.latest.get(name)
-            if again is not None:
-                result = again(args, more)
-                if result is not MISS:
-                    return result
-            key, arrays = None, []
-            if not dyn.values.tensors or not records_gradient((), dyn.values):
-                result, key, arrays = dyn._replays.replay(name, args, more)
-                if result is not MISS:
-                    return result
-            if is_exported() and in_graph:
-                return call_in_graph(dyn._handle, *graphed, args, more)
-            if self.derivative is not None and records_gradient((*args, *more.values()), dyn.values):
-                arguments = dict(zip(names, args, strict=False)) | more
-                if len(arguments) < len(args) + len(more) or not arguments.keys() <= names.keys():
-                    signature.bind(dyn, *args, **more)  # raises TypeError
-                return call_with_gradient(dyn, self, arguments, (args, more))
-            settle((*args, *more.values()))
-            return dyn._replays.run(key, arrays, lambda: function(dyn, *args, **more))
+            return dispatch(self, dyn, args, more)
 
         self._methods.append(call)
         return cast(MethodT, call)
+
+    def public(self, function: MethodT) -> MethodT:
+        """Declare how users call an operation with bundles: by the signature of ``function``, whose body never runs.
+
+        Bundles are expanded into arguments of the method first, so that recorded calls, torch and JAX see numbers,
+        strings and arrays. Of a bundle they see what differs from the defaults.
+        """
+        vars(function)["operation"] = self
+        parameters = list(inspect.signature(function).parameters.values())[1:]
+        names = frozenset(one.name for one in parameters)
+        most = sum(one.kind is inspect.Parameter.POSITIONAL_OR_KEYWORD for one in parameters)
+        bundles, title = tuple((one.name, one.expand) for one in self.bundles), f"Dynamics.{self.name}"
+        self.function.__qualname__ = self.name  # in errors of Python
+
+        @functools.wraps(function)
+        def call(dyn: Any, *args: Any, **more: Any) -> Any:
+            if len(args) > most or not more.keys() <= names:
+                self._refuse_call(parameters, args, more)
+            for name, expand in bundles:
+                if name in more:
+                    more.update(expand(title, more.pop(name)))
+            return dispatch(self, dyn, args, more)
+
+        self._methods.append(call)
+        return cast(MethodT, call)
+
+    def _refuse_call(self, parameters: Sequence[inspect.Parameter], args: tuple, more: dict[str, Any]) -> NoReturn:
+        """Raise TypeError for a call that is not written as the signature says."""
+        title, names = f"Dynamics.{self.name}", [one.name for one in parameters]
+        by_place = [one.name for one in parameters if one.kind is inspect.Parameter.POSITIONAL_OR_KEYWORD]
+        by_name = [f"{name}=" for name in names if name not in by_place]
+        form = f"dyn.{self.name}({', '.join((*by_place, *by_name))})"
+        for name in more:
+            for bundle in self.bundles:
+                if name in bundle.members:
+                    bundle.refuse(title, name)
+            if name not in names:
+                raise TypeError(f"{title}: {name}= is no argument; expected {form}")
+        raise TypeError(f"{title}: {len(args)} arguments by position; expected {len(by_place)} at most, as in {form}")
+
+    def expand(self, call: str, options: dict[str, Any]) -> dict[str, Any]:
+        """Return options by name, where bundles of options are replaced by their members.
+
+        Raises:
+            TypeError: a member is given by itself.
+        """
+        return self._replace(call, options, tuple(one for one in self.bundles if not one.written))
+
+    def expand_asked(self, call: str, options: dict[str, Any]) -> dict[str, Any]:
+        """Return what ``prepare`` is given, as :meth:`expand`; an array that the call fills is True.
+
+        Raises:
+            TypeError: a member is given by itself. ValueError: a bundle has no such member.
+        """
+        return self._replace(call, options, self.bundles, asked=True)
+
+    def as_given(self, names: Sequence[str]) -> list[str]:
+        """Return names of arguments as callers know them: a bundle in place of its members."""
+        homes = {name: bundle.name for bundle in self.bundles for name in bundle.members}
+        return list(dict.fromkeys(homes.get(name, name) for name in names))
+
+    def _replace(
+        self, call: str, options: dict[str, Any], bundles: tuple[Bundle, ...], asked: bool = False
+    ) -> dict[str, Any]:
+        found = dict(options)
+        for bundle in bundles:
+            for name in options:
+                if name in bundle.members:
+                    bundle.refuse(call, name, asked)
+            if bundle.name in options:
+                found.update((bundle.ask if asked else bundle.expand)(call, found.pop(bundle.name)))
+        return found
 
     def run(self, dyn: Any, *args: Any, **more: Any) -> Any:
         """Return the result without torch's gradients."""
@@ -354,8 +451,27 @@ class Operation:
 
     @property
     def entry(self) -> Callable[..., Any]:
-        """The method as users call it; its first argument is the Dynamics."""
+        """The method with all arguments by name; its first argument is the Dynamics."""
+        return self._methods[1]
+
+    @property
+    def method_of_users(self) -> Callable[..., Any]:
+        """The method as users call it: with bundles, where the operation has some; otherwise :attr:`entry`."""
         return self._methods[-1]
+
+    @functools.cached_property
+    def signature(self) -> inspect.Signature:
+        """Signature of :attr:`function`."""
+        return inspect.signature(self.function)
+
+    @functools.cached_property
+    def parameters(self) -> dict[str, inspect.Parameter]:
+        """Parameters of :attr:`function` but for the Dynamics, by name."""
+        return dict(list(self.signature.parameters.items())[1:])
+
+    def needs(self, name: str) -> bool:
+        """Return whether each call passes an argument; ``...`` is the default of one that follows others with some."""
+        return self.parameters[name].default in (inspect.Parameter.empty, ...)
 
     @functools.cached_property
     def arrays(self) -> tuple[Argument, ...]:
@@ -397,6 +513,8 @@ def seconds(call: Call, dt: Any) -> float:
     name = call.name
     if isinstance(dt, float):
         found = float(dt)
+    elif dt is ...:
+        raise TypeError(f"{name}: dt is missing; expected a number of seconds, the same in all worlds")
     elif getattr(dt, "requires_grad", False):
         raise ValueError(f"{name}: dt requires grad; derivatives are not available through this call; pass float(dt)")
     else:

@@ -29,13 +29,13 @@ def prepare(self: Dynamics, operation: str, *more: str | tuple[str, Mapping[str,
         operation: name of a method, such as "forward_dynamics".
         more: further operations, each a name, or a pair of a name and a dict of its options.
         options: of the first operation. ``frames=`` for operations that take frames, ``columns=`` for
-            solve_mass_matrix, ``prescribed=`` for hybrid_dynamics, ``integrator=`` for step, ``hold=``
-            for project, ``seeds=`` for inverse_kinematics, and ``body_f=True``, ``status=True``, ``qdd=True``,
-            ``target_q=True``, ``target_qd=True``, ``ctrl=True``, ``contact_f=True`` and the like, and ``q=True`` for
+            solve_mass_matrix, ``prescribed=`` for hybrid_dynamics, ``hold=`` for project, ``seeds=`` for
+            inverse_kinematics, ``options=StepOptions(...)`` and names ``report=("qdd", "contact_f")`` for step, and
+            ``body_f=True``, ``status=True``, ``target_q=True``, ``target_qd=True``, ``ctrl=True``, and ``q=True`` for
             inverse_kinematics, if they will be passed.
 
     Raises:
-        ValueError: no such operation or option.
+        ValueError: no such operation, option or report. TypeError: an option of a step, or a report, by itself.
     """
     pairs = [one if isinstance(one, tuple) and len(one) == 2 else (one, {}) for one in more]
     for name, own in pairs:
@@ -62,7 +62,7 @@ def _prepare(dyn: Dynamics, operation: Any, options: dict[str, Any]) -> None:
 
 
 def _prepare_operation(dyn: Dynamics, operation: Operation, options: dict[str, Any]) -> None:
-    operation.entry(dyn, **stand_ins(dyn, operation, options))
+    operation.entry(dyn, **stand_ins(dyn, operation, operation.expand_asked("Dynamics.prepare", options)))
 
 
 def stand_ins(dyn: Dynamics, operation: Operation, options: dict[str, Any] | None = None) -> dict[str, Any]:

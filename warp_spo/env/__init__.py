@@ -23,7 +23,7 @@ and :mod:`.terminations`.
 **What a step does**, arrays [world, ...], kernels in capitals::
 
     actions ──ACT──> ctrl, target_q or tau                       scale, offset, clip; action history
-            dyn.step(substeps=decimation) ──> q, qd, contact_f, contact_gap, contact_slip
+            dyn.step ──> q, qd, contact_f, contact_gap, contact_slip
             JUDGE: q, qd, contacts, memory ──> reward, done, time_out; and in worlds that are done new q, qd;
                    commands, pushes, timers, sums of episodes, air times
             dyn.reset_actuator_state(done)

@@ -11,6 +11,7 @@ import torch
 import warp as wp
 
 from ..dynamics.dynamics import Dynamics
+from ..dynamics.stepping.options import StepOptions, StepReport
 from ..execution.device_facts import read_facts
 from ..recursions.contact.ground import GROUND, SINGLE
 from ..runtime.arrays import parse_device
@@ -125,7 +126,8 @@ class Env(VecEnv):
         self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=variable, granularity=granularity)
         store = self._store = self._allocate(tracing)
         self.q, self.qd, self.actions, self.chosen = (store.tensors[n] for n in ("q", "qd", "actions", "chosen"))
-        self._tensors, self._controls, self._step_arrays = store.tensors, store.controls, store.written
+        self._tensors, self._controls, self._report = store.tensors, store.controls, StepReport(**store.written)
+        self._step_options = StepOptions(substeps=self.decimation, passes=self._passes)
         self.values, self._actuator_state = store.values, self._delay_buffers(events)
         self._log = Log(self._layout, self.reward_names, self.termination_names, self.device, worlds)
         self.set_seed(self.seed)
@@ -347,21 +349,17 @@ class Env(VecEnv):
     def _physics(self) -> None:
         self._launch("act")
         controls = self._controls
-        options: dict[str, Any] = dict(self._step_arrays)
-        if self._passes is not None:
-            options["passes"] = self._passes
-        if self._actuator_state is not None:
-            options["actuator_state"] = self._actuator_state
         self.dyn.step(
             self.q,
             self.qd,
             controls.get("tau"),
             self.dt,
-            target_q=controls.get("target_q"),
             ctrl=controls.get("ctrl"),
-            substeps=self.decimation,
+            target_q=controls.get("target_q"),
+            actuator_state=self._actuator_state,
+            options=self._step_options,
+            report=self._report,
             out=(self.q, self.qd),
-            **options,
         )
         if "actuator_force" in self._tensors:
             self.dyn.actuator_force(self.q, self.qd, controls["ctrl"], out=self._tensors["actuator_force"])
@@ -388,7 +386,7 @@ class Env(VecEnv):
             self.dyn.frame_poses(self.q, frames, out=self._tensors["frame_pose"])
             self.dyn.frame_velocities(self.q, self.qd, frames, out=self._tensors["frame_velocity"])
         if any(kernel.reads_accelerations for kernel in kernels):
-            qdd, out = self._step_arrays["qdd"], self._tensors["frame_acceleration"]
+            qdd, out = self._report.qdd, self._tensors["frame_acceleration"]
             self.dyn.frame_accelerations(self.q, self.qd, qdd, frames, out=out)
 
     def _user_parts(self, stage: str) -> list[Part]:

@@ -33,7 +33,7 @@ def main(seconds=10.0, dt=1e-3, worlds=1, device=None, picture=None):
     times, angles, drifts = [0.0], [q[0, 0]], [0.0]
     q, qd = (wp.array(x, dtype=wp.float64, device=dyn.device) for x in (q, qd))  # steps in place are quickest
     for step in range(1, round(seconds / dt) + 1):
-        dyn.step(q, qd, None, dt, integrator="rk4", out=(q, qd))
+        dyn.step(q, qd, None, dt, options=spo.StepOptions(integrator="rk4"), out=(q, qd))
         if step % 20 == 0:
             times.append(step * dt)
             angles.append(q.numpy()[0, 0])

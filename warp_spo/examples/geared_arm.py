@@ -38,7 +38,7 @@ def main(seconds=2.0, dt=2e-3, worlds=4, device=None, picture=None):
         q, qd = start, 0.0 * start
         swings.append([q])
         for _ in range(round(seconds / dt)):
-            q, qd = each.step(q, qd, None, dt, integrator="rk4")
+            q, qd = each.step(q, qd, None, dt, options=spo.StepOptions(integrator="rk4"))
             swings[-1].append(q)
     if picture:
         with drawing(picture, "A gear of 30 : 1, released", "Error of reflected inertia") as (left, right):

@@ -117,13 +117,13 @@ def main(worlds=3, seconds=7.0, dt=5e-3, device=None, picture=None):
     dyn.set(contact_friction=np.tile(friction[:, None], (1, dyn.scene.contact_count)).astype(np.float32))
     heights, points, q = path(dyn, seconds)
     q, qd = q.astype(np.float32), np.zeros((worlds, dyn.scene.dof_count), np.float32)
-    tau, force = np.zeros_like(qd), np.zeros((worlds, dyn.scene.contact_count, 3), np.float32)
+    tau, loads = np.zeros_like(qd), dyn.step_report("contact_f", like=q)
     tau[:, 7:9] = -FORCE  # both fingers close
     target, rows = q.copy(), []
     for step in range(round(seconds / dt)):
         target[:, :7] = lifted(heights, points, step * dt)
-        q, qd = dyn.step(q, qd, tau, dt, target_q=target, contact_f=force)
-        rows.append(row(dyn, q, force, step * dt))
+        q, qd = dyn.step(q, qd, tau, dt, target_q=target, report=loads)
+        rows.append(row(dyn, q, loads.contact_f, step * dt))
     times, heights, apart, shown = report(friction, rows)
     if picture:
         with drawing(picture, "The cube", "Its place in the hand") as (left, right):

@@ -29,7 +29,7 @@ def main(seconds=0.3, dt=2e-4, worlds=12, device=None, picture=None):
     q, qd = np.zeros((worlds, 2)), np.tile([0.0, 1.0], (worlds, 1))  # the arm is hit: 1 rad/s
     motion = [q]
     for _ in range(round(seconds / dt)):
-        q, qd = dyn.step(q, qd, None, dt, integrator="rk4")
+        q, qd = dyn.step(q, qd, None, dt, options=spo.StepOptions(integrator="rk4"))
         motion.append(q)
     d = np.array(motion)[..., 1]
     cosine = ((d[:-2] + d[2:]) * d[1:-1]).sum(0) / (2.0 * (d[1:-1] ** 2).sum(0))

@@ -48,16 +48,17 @@ def main(worlds=4, iterations=60, device=None, picture=None):
     q0, qd0 = start(dyn)
     heights = torch.linspace(*HEIGHTS, worlds, dtype=q0.dtype, device=q0.device)
     knots = torch.zeros((KNOTS, worlds, 2), dtype=q0.dtype, device=q0.device, requires_grad=True)
-    optimizer, losses, force = torch.optim.Adam([knots], lr=1.0), [], torch.empty_like(q0)[:, None]
+    optimizer, losses = torch.optim.Adam([knots], lr=1.0), []
+    report = dyn.step_report("contact_f", like=q0)
     for _ in range(iterations):
         q, qd, path, loads = q0, qd0, [], []
         for step in range(STEPS):
             knot, part = divmod(step * (KNOTS - 1) / STEPS, 1.0)
             torques = torch.lerp(knots[int(knot)], knots[int(knot) + 1], part)
             # The step is recorded by autograd; its gradient goes back through each of its passes.
-            q, qd = dyn.step(q, qd, torch.nn.functional.pad(torques, (1, 0)), DT, target_q=q0, contact_f=force)
+            q, qd = dyn.step(q, qd, torch.nn.functional.pad(torques, (1, 0)), DT, target_q=q0, report=report)
             path.append(q.detach()[:, 0])
-            loads.append(force[:, 0, 2].clone())
+            loads.append(report.contact_f[:, 0, 2].clone())
         off = (q[:, 0] - heights).square()
         loss = off.sum() + 1e-4 * qd.square().sum() + 1e-7 * knots.square().sum()
         optimizer.zero_grad()

@@ -33,7 +33,7 @@ def main(seconds=4.0, dt=5e-3, worlds=3, device=None, picture=None):
     momentum = lambda: np.einsum("wi,wi->w", dyn.mass_matrix(q)[:, 0], qd)  # noqa: E731
     start, times, spins, angles = momentum(), [0.0], [qd[:, 0]], [q[:, 1:]]
     for step in range(1, round(seconds / dt) + 1):
-        q, qd = dyn.step(q, qd, None, dt, integrator="rk4")
+        q, qd = dyn.step(q, qd, None, dt, options=spo.StepOptions(integrator="rk4"))
         times.append(step * dt)
         spins.append(qd[:, 0])
         angles.append(q[:, 1:])

@@ -38,7 +38,7 @@ def main(seconds=4.0, dt=0.01, worlds=3, device=None, picture=None):
     for step in range(1, round(seconds / dt) + 1):
         load[..., :3] = -DRAG * MASS / LINKS * dyn.body_velocities(q, qd)[..., :3]
         load[:, -1, :3] += pull
-        q, qd = dyn.step(q, qd, None, dt, body_f=load, integrator="rk4")
+        q, qd = dyn.step(q, qd, None, dt, body_f=load, options=spo.StepOptions(integrator="rk4"))
         times.append(step * dt)
         shapes.append(dyn.frame_poses(q, ends)[..., :3])
     errors = np.linalg.norm(np.array(shapes) - wanted, axis=-1).max(-1)

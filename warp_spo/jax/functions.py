@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import inspect
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -60,8 +59,8 @@ def function(
         values: Names of values of the scene among ``variable`` of ``dyn``, which the function takes by name:
             ``[world, ...]``, or ``[...]`` of one world under ``vmap``; ``ground_heights`` as :meth:`Dynamics.set` takes
             them, for all worlds. They cost four launches more in each direction.
-        options: The operation's arguments that are not arrays, such as ``dt`` and ``frames``. With ``status=True``, for
-            operations that take it, the status [world], int32, follows the results.
+        options: The operation's arguments that are not arrays, such as ``dt``, ``frames`` and a step's ``options``.
+            With ``status=True``, for operations that take it, the status [world], int32, follows the results.
 
     Raises:
         TypeError: ``dyn`` is no Dynamics, or the options are not those of the operation.
@@ -74,6 +73,7 @@ def function(
     if not isinstance(operation, str) or operation not in known:
         raise ValueError(f"warp_spo.jax.function: operation is {operation!r}; expected one of {', '.join(known)}")
     names = as_names("warp_spo.jax.function", "values", values, ("gravity",))
+    options = known[operation].expand(f"warp_spo.jax.function({operation!r})", options)
     return Function(dyn, known[operation], options, capture, names)
 
 
@@ -141,19 +141,18 @@ class Function:
         return True
 
     def _check_options(self) -> None:
-        parameters = inspect.signature(self.operation.function).parameters
-        expected = {one.name: parameters[one.name].default for one in self.operation.options if one.name in parameters}
+        expected = [one.name for one in self.operation.options if one.name in self.operation.parameters]
         written = [one.name for one in self.operation.options if one.stand_in is not None]
         for name in self.options:
             if name in written:
                 raise TypeError(f"{self.name}: {name}= holds memory that the call writes, which JAX would not know")
             if name not in expected:
-                words = ", ".join(f"{one}=" for one in expected) or "none"
+                words = ", ".join(f"{one}=" for one in self.operation.as_given(expected)) or "none"
                 raise TypeError(
                     f"{self.name}: {name}= is no option; expected {words}; arrays go to the function itself"
                 )
-        for name, default in expected.items():
-            if default is inspect.Parameter.empty and name not in self.options:
+        for name in expected:
+            if self.operation.needs(name) and name not in self.options:
                 raise TypeError(f"{self.name}: {name} is missing; expected {name}=")
         call = Call(self.name, self.dyn.device, self.dyn.dtype)
         for one in self.operation.options:
@@ -216,8 +215,7 @@ class Function:
 
     def is_needed(self, name: str) -> bool:
         """Whether each call takes an argument."""
-        parameters = inspect.signature(self.operation.function).parameters
-        return name in self.values or parameters[name].default is inspect.Parameter.empty
+        return name in self.values or self.operation.needs(name)
 
     def _as_array(self, name: str, array: Any) -> Any:
         """Return an argument as a JAX array; NumPy arrays are cast."""

@@ -101,7 +101,7 @@ class ObservableArrays:
             setattr(observables, name, wp.zeros_like(self._unasked[name]))
 
     def contact_arguments(self, observables: Any) -> dict[str, wp.array]:
-        """Return the arrays that receive the observables of contacts, as arguments of ``Dynamics.step``."""
+        """Return the arrays that receive the observables of contacts, by the names of reports of ``Dynamics.step``."""
         given = {}
         for name, unasked in self._unasked.items():
             array = unasked if getattr(observables, name) is None else getattr(observables, name)

@@ -12,7 +12,8 @@ from newton import ModelFlags, StateFlags
 from newton.solvers import SolverBase
 
 from ..dynamics.dynamics import Dynamics
-from ..dynamics.stepping.step import INTEGRATORS
+from ..dynamics.stepping.integrators import INTEGRATORS
+from ..dynamics.stepping.options import StepOptions, StepReport
 from ..errors import UnsupportedError, as_integer, as_names, never_copied, shown
 from ..kernels import declare, newton_arrays
 from ..runtime import launches
@@ -348,10 +349,10 @@ class SolverSPO(MassMatrixInterface, SolverBase):
         body_f = None if state_in.body_f is None else at.wrenches.read(state_in.body_f, "body_f")
         tau = self._joint_forces.read(control.joint_f, q, self._arrays.used["joint_X_p"])
         given: dict[str, Any] = dict(tau=tau, body_f=body_f, **self._drives.targets(control, at.q, at.qd))
-        if self._observable_arrays.of_contacts:
-            given["passes"] = self._passes
-        if self._substeps > 1:
-            dt, given["substeps"] = dt / self._substeps, self._substeps
+        options = StepOptions(
+            self.integrator, self._substeps, self._passes if self._observable_arrays.of_contacts else None
+        )
+        dt = dt / self._substeps if self._substeps > 1 else dt
         if self._slots is not None:
             if state_in.body_q is None:
                 raise ValueError(
@@ -362,19 +363,23 @@ class SolverSPO(MassMatrixInterface, SolverBase):
         if observables is None or not observables.kinds:
             q_out, qd_out = at.q.target(state_out.joint_q, "q_out"), at.qd.target(state_out.joint_qd, "qd_out")
             if qdd is not None:  # the kernel of steps with observables
-                given |= {"qdd": qdd, "status": self._observable_arrays.status}
+                given["status"] = self._observable_arrays.status
+            poses = velocities = None
             if contacts is None:  # which are marked by the poses before the step
                 bodies = self._bodies.targets(state_out)
-                given |= {} if bodies is None else {"poses": bodies[0], "velocities": bodies[1]}
-            self.dynamics.step(q, qd, dt=dt, integrator=self.integrator, out=(q_out, qd_out), **given)
+                poses, velocities = (None, None) if bodies is None else bodies
+            report = StepReport(qdd=qdd, poses=poses, velocities=velocities)
+            self.dynamics.step(q, qd, dt=dt, options=options, report=report, out=(q_out, qd_out), **given)
             if contacts is not None:
                 self._words.mark(contacts, self._words.kept, state_in.body_q)
         else:  # observables are computed from the state before the step, which state_out must not overwrite yet
             q_out, qd_out = at.q.buffer("q_out"), at.qd.buffer("qd_out")
             qdd = at.qd.buffer("qdd") if qdd is None else qdd
             status = self._observable_arrays.status if observables.status is None else observables.status
-            given |= self._observable_arrays.contact_arguments(observables)
-            self.dynamics.step(q, qd, dt=dt, out=(q_out, qd_out), qdd=qdd, status=status, **given)
+            report = StepReport(qdd=qdd, **self._observable_arrays.contact_arguments(observables))
+            self.dynamics.step(
+                q, qd, dt=dt, options=options, status=status, report=report, out=(q_out, qd_out), **given
+            )
             if contacts is not None:
                 self._words.mark(contacts, status, state_in.body_q)
             self._words.keep(status)

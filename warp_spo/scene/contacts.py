@@ -9,9 +9,27 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import UnsupportedError, as_integer
-from .checks import checked_array, read_only
-from .contact_shapes import ARGUMENTS, SHAPES, ContactShape, ShapeArguments
-from .ground import HeightField, Listed, Plane
+from .checks import checked_array, checked_unit, read_only
+from .hulls import with_corners
+from .pairs import pair_values
+from .pickling import Stored, StoredPart
+
+CONTACT_VALUES = ("contact_friction", "contact_stiffness", "contact_damping")
+"""Names of a scene's values that come from its contacts, one entry a point."""
+HEIGHTS = "ground_heights"
+GROUND_VALUES = ("ground_origin", "ground_field", "contact_place", HEIGHTS)
+"""Names of a scene's values that come from its ground."""
+STATIC_SINK = 1.7e-3  # how far a robot sinks in [m] that rests on its points, where the stiffness is chosen
+POINTS_AT_REST = 4  # points at most on which a robot rests
+BODIES_AT_REST = 2  # bodies at most whose points, up to POINTS_AT_REST each, carry a robot
+TIPPING_MARGIN = (
+    1.6  # moment that holds up one leg over the one that tips it: 360 N m/rad of 226 for a humanoid of 33 kg
+)
+DAMPING = 0.5  # of sqrt(k m), the share of mass over one point; standing is quiet from 0.1 to 2
+DIRECTIONS = 2048  # in which the extreme points of a hull are looked for
+AT_ONCE = 1 << 26  # numbers in memory while these points are looked for
+STEEP = 1.0  # slope beyond which a cell of a height field is a wall and a floor
+STANDARD_GRAVITY = 9.81  # [m/s^2], in scenes without gravity
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -132,3 +150,126 @@ def check_contacts(contacts: Sequence[Contact], ground: Any, bodies: Sequence[An
             raise ValueError(f"Scene: {name} is on body {index}; expected one of {len(bodies)} bodies, 0 and up")
         if bodies[index].modes is not None:
             raise UnsupportedError(f"Scene: {name}", "a contact of a body with modes", "put it on a rigid body")
+
+
+def check_field(call: str, name: str, array: np.ndarray, ground: Any) -> None:
+    """Raise ValueError unless ``ground_field`` holds numbers of fields, and all worlds share ``ground_heights``."""
+    if name == HEIGHTS and len(array) > 1:
+        raise ValueError(
+            f"{call}: {name} has shape {array.shape}; expected {array.shape[1:]}, because all worlds share the heights;"
+            " make a HeightField of several fields, and say by ground_field which of them a world stands on"
+        )
+    if name == "ground_field" and array.size and not np.isin(array, np.arange(ground.count)).all():
+        raise ValueError(
+            f"{call}: {name} holds {array.min():g} to {array.max():g}; expected integers below {ground.count}"
+        )
+
+
+class NeutralPose(Stored):
+    """A scene in its neutral configuration, as the constants of contacts need it."""
+
+    def __init__(self, scene: Any):
+        values = {name: array[0] for name, array in scene.values.items()}
+        self.places = np.empty((len(scene.bodies), 4, 4))
+        self.roots = np.arange(len(scene.bodies))
+        for body in (body for level in scene.tree.levels for body in level):
+            hinge = scene.hinge_of[body]
+            parent = scene.tree.parent[body]
+            place = pose_matrix(values["joint_X_p"][hinge]) @ np.linalg.inv(pose_matrix(values["joint_X_c"][hinge]))
+            if parent >= 0:
+                place, self.roots[body] = self.places[parent] @ place, self.roots[parent]
+            self.places[body] = place
+        self.masses = values["body_mass"]
+        self.coms = np.einsum("bij,bj->bi", self.places[:, :3, :3], values["body_com"]) + self.places[:, :3, 3]
+        size = np.linalg.norm(values["gravity"])
+        self.gravity = float(size) or STANDARD_GRAVITY
+        self.up = -values["gravity"] / size if size else np.array([0.0, 0.0, 1.0])
+
+    def position(self, point: ContactPoint) -> np.ndarray:
+        """Return the place of a point in the inertial frame."""
+        place = self.places[point.body]
+        return place[:3, :3] @ point.position + place[:3, 3]
+
+
+def contact_values(scene: Any) -> dict[str, np.ndarray]:
+    """Return the values of a scene that come from its contacts, [1, point] by name, and from its ground.
+
+    Values that are None are chosen.
+    """
+    points = scene.contact_points
+    values = {name: np.zeros((1, scene.contact_count)) for name in CONTACT_VALUES}
+    sets = isinstance(scene.ground, HeightField) and scene.ground.heights.ndim == 3
+    values |= {
+        "ground_origin": np.zeros((1, 3 if scene.contact_count else 0)),
+        "ground_field": np.zeros((1, 1 if sets else 0)),
+        HEIGHTS: scene.ground.heights[None] if isinstance(scene.ground, HeightField) else np.zeros((1, 0)),
+        "contact_place": np.tile([0.0] * 5 + [1.0, AWAY], (1, len(points) if isinstance(scene.ground, Listed) else 0)),
+    }
+    if not scene.contact_count:
+        return values
+    neutral = NeutralPose(scene)
+    for i, pair in enumerate(scene.contact_pairs, start=len(points)):
+        found = pair_values(pair, scene, neutral)
+        for name, value in zip(CONTACT_VALUES, found, strict=True):
+            values[name][0, i] = value
+    positions = np.array([neutral.position(point) for point in points])
+    bodies = np.array([point.body for point in points])
+    for i, point in enumerate(points):
+        contact, tree = scene.contacts[point.contact], neutral.roots == neutral.roots[point.body]
+        mass, own = float(neutral.masses[tree].sum()), positions[bodies == point.body]
+        com = neutral.masses[tree] @ neutral.coms[tree] / mass if mass else own.mean(axis=0)
+        at_rest = min(POINTS_AT_REST, int(tree[bodies].sum()))
+        k = contact.stiffness
+        if k is None:
+            k = max(
+                mass * neutral.gravity / (at_rest * STATIC_SINK),
+                _foot_stiffness(own, mass * neutral.gravity, com, neutral.up),
+            )
+            k = k or 1.0  # of massless bodies
+        d = contact.damping if contact.dissipation is None else contact.dissipation
+        if d is None:
+            shared = max(at_rest, min(BODIES_AT_REST, len(set(bodies[tree[bodies]]))) * min(len(own), POINTS_AT_REST))
+            d = DAMPING * np.sqrt(k * mass / shared)
+        for name, value in zip(CONTACT_VALUES, (contact.friction, k, d), strict=True):
+            values[name][0, i] = value
+    return {name: read_only(value) for name, value in values.items()}
+
+
+def _foot_stiffness(points: np.ndarray, weight: float, com: np.ndarray, up: np.ndarray) -> float:
+    """Return k with n k b^2 = TIPPING_MARGIN m g l: the points of one body hold up the robot; 0 if they span no area.
+
+    b is half the width of the points across their longest extent, l how far the centre of mass lies above them.
+    """
+    centred = points - points.mean(axis=0)
+    width = np.ptp(centred @ np.linalg.svd(centred)[2][1]) / 2.0 if len(points) > 2 else 0.0
+    height = max(float(up @ (com - points.mean(axis=0))), 0.0)
+    return TIPPING_MARGIN * weight * height / (len(points) * width**2) if width > 0.0 else 0.0
+
+
+def contact_figures(scene: Any) -> str:
+    """Return a line on the scene's contacts."""
+    points, pairs = scene.contact_points, scene.contact_pairs
+    if not scene.contact_count:
+        return "none"
+    bodies, ground = len({point.body for point in points}), type(scene.ground).__name__
+    parts = [f"{len(points)} points of {bodies} bodies with the {ground}"] if points else []
+    parts += [f"{len(pairs)} pairs of bodies"] if pairs else []
+    figures, graded = [], np.array([point.dissipates for point in points] + [False] * len(pairs))
+    rows = [(name.removeprefix("contact_"), name, np.full(len(graded), True)) for name in CONTACT_VALUES[:2]]
+    rows += [("damping", "contact_damping", ~graded), ("dissipation", "contact_damping", graded)]
+    for (label, name, which), unit in zip(rows, ("", " N/m", " N s/m", " s/m"), strict=True):
+        if which.any():
+            low, high = scene.values[name][:, which].min(), scene.values[name][:, which].max()
+            value = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+            figures.append(f"{label} {value}{unit}")
+    return f"{', '.join(parts)}; {', '.join(figures)}"
+
+
+def pose_matrix(pose: np.ndarray) -> np.ndarray:
+    """Return the 4 x 4 matrix of a pose (x, y, z, qx, qy, qz, qw) with a unit quaternion."""
+    x, y, z, w = pose[3:]
+    axis, found = np.array([x, y, z]), np.eye(4)
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    found[:3, :3] = (w * w - axis @ axis) * np.eye(3) + 2.0 * np.outer(axis, axis) + 2.0 * w * across
+    found[:3, 3] = pose[:3]
+    return found

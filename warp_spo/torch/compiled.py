@@ -6,7 +6,6 @@ that torch traces is :func:`call_in_graph`; kernels are compiled and launched wh
 
 import ast
 import functools
-import inspect
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from ..dynamics.operation import Operation
 
 NUMBER = "a number"  # stands among the options for one that the op takes as a number
-RESULTS = ("out", "qdd", "status", "actuator_state")  # arguments that a call writes, which custom_op does not take
+RESULTS = ("out", "actuator_state")  # arguments that a call writes besides those declared so
 ONLY = {"integrator": "semi_implicit", "substeps": 1}  # options of which gradients know one value
 PLAIN = (bool, int, str, list, tuple, type(None))  # classes of options that a graph takes, and of their entries
 CALL = "str dyn, str operation, str names, str options, float number, {}, Tensor[] tensors"
@@ -225,14 +224,14 @@ def call_in_graph(
 
 def _check_options(declared: "Operation", by: tuple[str, ...], options: dict[str, Any]) -> None:
     """Raise TypeError unless ``options`` are the arguments that the operation needs besides the tensors ``by``."""
-    operation, parameters = declared.name, inspect.signature(declared.function).parameters
-    rest = {n: p.default for n, p in parameters.items() if n not in (*by, *RESULTS, *ONLY, "self")}
-    expected = ", ".join(f"{n}=" for n in rest) or "none"
+    operation, written = declared.name, tuple(one.name for one in declared.arrays if one.written)
+    rest = [name for name in declared.parameters if name not in (*by, *RESULTS, *written, *ONLY)]
+    expected = ", ".join(f"{name}=" for name in declared.as_given(rest)) or "none"
     for name in options:
         if name not in rest and (name not in ONLY or options[name] != ONLY[name]):
             raise TypeError(f"custom_op({operation!r}): {name}={options[name]!r} is no option; expected {expected}")
-    for name, default in rest.items():
-        if default is inspect.Parameter.empty and name not in options:
+    for name in rest:
+        if declared.needs(name) and name not in options:
             raise TypeError(f"custom_op({operation!r}): {name} is missing; expected {expected}")
 
 
@@ -251,7 +250,7 @@ def custom_op(dyn: "Dynamics", operation: str, **options: Any) -> Callable[..., 
     Args:
         dyn: The Dynamics.
         operation: Name of an operation that has gradients.
-        options: The operation's arguments that are not tensors.
+        options: The operation's arguments that are not tensors, such as ``dt`` and a step's ``options``.
 
     Returns:
         A function of the operation's tensors [world, ...], by position or by name, and None where the method takes it.
@@ -269,6 +268,7 @@ def custom_op(dyn: "Dynamics", operation: str, **options: Any) -> Callable[..., 
         raise ValueError(f"custom_op: operation is {operation!r}; expected one of {', '.join(known)}")
     declared, derivative = dyn._operations[operation], known[operation]
     by, keeps, results = derivative.by, derivative.keeps, len(declared.results)
+    options = declared.expand(f"custom_op({operation!r})", options)
     _check_options(declared, by, options)
     dyn._gradients.check(declared)
     parameters = (*by, *options)

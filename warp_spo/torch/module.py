@@ -18,7 +18,7 @@ def _make_method(operation: str) -> Callable[..., Any]:
     def method(self: "Module", *args: Any, **more: Any) -> Any:
         with self.dyn.recursions.call_order.lock:  # no other thread may set values between
             self.dyn.set(**dict(self.named_parameters()))
-            return self.dyn._operations[operation].entry(self.dyn, *args, **more)
+            return self.dyn._operations[operation].method_of_users(self.dyn, *args, **more)
 
     method.__name__, method.__qualname__ = operation, f"Module.{operation}"
     method.__doc__ = f"Return :meth:`warp_spo.Dynamics.{operation}` at the parameters."

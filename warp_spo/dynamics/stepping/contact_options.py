@@ -89,5 +89,5 @@ def explain(dyn: Dynamics) -> str:
     if dyn.plan.of(routine) == "segment" and routine.divides(dyn.scene, ()):
         held = dyn.programs.warps(routine) != 1  # 1: a kernel was built, and limbs found no room in it
         form = "a warp for each limb" if held else f"{form}: what limbs tell each other does not fit in shared memory"
-    passes = f"{default_passes(dyn.scene)} passes of a step unless passes= says otherwise, none at node"
+    passes = f"{default_passes(dyn.scene)} passes of a step unless StepOptions(passes=) says otherwise, none at node"
     return f"{figures}; {passes}; {form}"

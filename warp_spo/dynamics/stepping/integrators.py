@@ -43,11 +43,9 @@ def _limbs_couple(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
     return pair_pieces.by_limbs(scene)
 
 
-STEP = Routine(
-    "step", recursion.step, segments=SegmentForm(messages="PzaSX", divides=_divides, wide=True), passes=PassForm()
-)
+STEP = Routine("step", recursion.step, letters="PzaSX", divides=_divides, passes=True, wide=True)
 BODIES_BY_KINEMATICS = Routine(
-    "body_states", kinematics.body_states, segments=SegmentForm(wide=True, body_kinematics=True), passes=PassForm()
+    "body_states", kinematics.body_states, alone=True, passes=True, wide=True, body_kinematics=True
 )
 PAIRED_STEP = Routine(
     "paired_step",

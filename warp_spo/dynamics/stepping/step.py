@@ -11,7 +11,8 @@ from ...execution.routine import Routine
 from ...kernels import combination
 from ...recursions.derivatives import adjoints
 from ...recursions.loops import embedded_adjoints
-from ...runtime.arrays import AnyArray, ArrayT, Call
+from ...runtime import launches
+from ...runtime.arrays import WARP, AnyArray, ArrayT, Call, kind_of
 from ...status import Status
 from .. import actuators
 from ..gradients import by_name
@@ -40,8 +41,10 @@ from ..trial_inputs import rotations
 from . import contact_gradients, contact_options, integrators
 from .integrators import INTEGRATORS, StepArrays
 from .midpoint_contact import INTEGRATE_VJP
+from .options import OPTIONS, REPORT, REPORTS, StepOptions, StepReport, check_names
 
 MOST_FUSED = 1 << 10  # substeps in one kernel, so that it ends soon; drivers stop kernels that keep a display waiting
+DEFAULTS = StepOptions()
 SEVERITY = [Status(word).severity for word in range(len(Status))]
 
 if TYPE_CHECKING:
@@ -122,15 +125,14 @@ STEP = Operation(
         Argument("target_q", "world, coordinate", optional=True, asked=True),
         Argument("target_qd", "world, dof", optional=True, asked=True),
         Option("integrator", default=lambda scene: "semi_implicit"),
-        Argument("qdd", "world, dof", optional=True, asked=True, written=True),
         STATUS,
         CTRL,
         Option("actuator_state", asked=False, stand_in=actuators.stand_in),
-        *(Argument(name, axes, optional=True, asked=True, written=True) for name, axes in integrators.BODIES.items()),
         Option("substeps", default=lambda scene: 1),
         Option("passes", default=lambda scene: None),
-        *contact_options.ARGUMENTS,
+        *REPORTS,
     ),
+    bundles=(OPTIONS, REPORT),
     results=(Result("q", "world, coordinate", over="q"), Result("qd", "world, dof", over="qd")),
     routine=integrators.STEP,
     embed=integrators.EMBEDDED_STEP,
@@ -153,146 +155,32 @@ STEP = Operation(
 
 
 @STEP.method
-def step(
+def _step(
     self: Dynamics,
     q: ArrayT,
     qd: AnyArray,
-    tau: AnyArray | None,
-    dt: float,
+    tau: AnyArray | None = None,
+    dt: Any = ...,
     body_f: AnyArray | None = None,
     target_q: AnyArray | None = None,
     target_qd: AnyArray | None = None,
     integrator: str = "semi_implicit",
-    qdd: AnyArray | None = None,
     status: AnyArray | None = None,
     ctrl: AnyArray | None = None,
     actuator_state: actuators.ActuatorState | None = None,
     substeps: int = 1,
     passes: int | None = None,
+    qdd: AnyArray | None = None,
+    poses: AnyArray | None = None,
+    velocities: AnyArray | None = None,
     contact_f: AnyArray | None = None,
     contact_gap: AnyArray | None = None,
     contact_slip: AnyArray | None = None,
     contact_excess: AnyArray | None = None,
     contact_residual: AnyArray | None = None,
-    poses: AnyArray | None = None,
-    velocities: AnyArray | None = None,
     out: tuple[ArrayT | None, ArrayT | None] = (None, None),
 ) -> tuple[ArrayT, ArrayT]:
-    """Compute the state after ``dt``: forward dynamics with the forces of all hinges, and q moved along the new qd.
-
-    These forces act on each dof, by the scene's values; a force whose values are zero is left out. q' and qd' are the
-    state after the step:
-
-    * damping: -damping qd'. Spring: -stiffness (q' - rest), as in :meth:`passive_force`.
-    * drive: target_ke (target_q - q') + target_kd (target_qd - qd'), not beyond the effort limit.
-    * gravity compensation: -gravcomp mass gravity at the bodies' centres of mass, where they are before the step.
-    * limits: limit_ke (limit - q') where q' is outside, and -limit_kd qd' where q is outside; they never pull inward.
-      Limits of ball and free hinges: UnsupportedError.
-    * dry friction: at most joint_friction against the motion. A hinge that sticks creeps by up to 1e-4 rad/s or m/s. In
-      float32 a hinge that stops from 10 rad/s within a step can feel up to 2 % more friction than that, at worst 10 %,
-      in proportion to its rate, because the creep is as small as rounding errors of the rate. In float64 it does not.
-    * velocity limit: a damper on the excess over the limit, of 300 / dt times the inertia that the hinge feels at the
-      neutral q of world 0 with all other hinges free. There it shrinks the excess about three hundredfold in one step,
-      less where the hinge carries more. For a hinge that feels no inertia it is 300 times the resistance of its other
-      laws.
-    * actuators: the forces of :meth:`actuator_force` at ``ctrl``. On one hinge, bias[1] and bias[2] below zero are a
-      spring and a damper, at q' and qd' as a drive's, within the force range; the bounds of a torque-speed curve are
-      those at qd. All else is taken at qd and at q + dt qd, with a resistance to changes of qd that keeps the step
-      stable: of the curve's slope where the curve limits a motor, and of gear_i sum_j gear_j (-bias[2] - dt bias[1])
-      on each of several hinges, all gears positive. bias[1] and bias[2] above zero act at q, qd.
-
-    Effort and velocity limits of 1e6 and more, Newton's default, have no effect; nor do position limits of 1e10 and
-    more. Laws that are zero or unbounded in the scene generate no code. The forces are implicit, which takes one
-    addition to the mass matrix's diagonal: (Mass + dt R) qdd = tau - bias_force(q, qd) + F. Which parts of the
-    piecewise-linear laws hold is found in passes, in one launch, until no force changes (32 at most).
-
-    A scene with ``contacts`` takes a fixed number of passes instead, each one sweep. The first closes all points that
-    may touch, later ones open those that pull, and the last of three or more only closes. Friction, effort limits and
-    dry friction are then dampers that give their bound at the velocity of the pass before: a pass that ends outside of
-    a bound does so by what ``contact_excess`` says, and gains no energy at a held pose. The normal force of a point
-    is stiffness times depth plus damping times the speed inward, both after the step; there is no restitution. A point
-    that sticks creeps, by eps rho / sqrt(1 - rho^2) for the share rho of friction that is used. Pairs of bodies that
-    touch each other are solved together with all else, up to eight in a world, and in 16 rounds of one after the other
-    beyond. Contacts need integrator="semi_implicit", no closed loops, and another granularity than "node".
-
-    With four passes and more, half of what velocity terms add to the rates comes before the passes and half after them,
-    and inertias and contacts are half way along its path. In flight rates are then of second order, and the kinetic
-    energy changes by the work of the forces, which are implicit and lose energy. A round of as many passes finds the
-    path. How much faster a joint gets when its drive saturates is then found by each pass's own sweep, not from the
-    mass at the neutral pose.
-
-    Where Dynamics closes loops, accelerations obey the closures, with all of the above on every dof, those that a loop
-    moves included. Two Newton steps then move q', and qd' there, onto the closures; they leave O((h rate)^6), 1e-10 at
-    1 ms and 30 rad/s. An open state closes within a few steps; ``project`` closes it at once. With embedded loops the
-    step is one kernel, and gradients through rollouts are exact: they include the projection. loops="multipliers" takes
-    several launches, has no gradients, and raises UnsupportedError for limits, friction, effort and velocity limits.
-
-    Args:
-        q: coordinates [world, coordinate].
-        qd: velocities [world, dof].
-        tau: forces dual to qd [world, dof]; None means zero.
-        dt: length of the step [s], of each substep where there are several, the same in all worlds. It does not fold:
-            changing it compiles nothing.
-        body_f: as :meth:`forward_dynamics`.
-        target_q: position targets of the drives [world, coordinate]; None means the neutral q.
-        target_qd: velocity targets of the drives [world, dof]; None means zero.
-        integrator: "semi_implicit": order 1. "midpoint": implicit midpoint, order 2; the forces above are implicit, and
-            the velocity terms take six fixed-point iterations, which diverge where a link turns by much of a radian in
-            a step. "rk4": order 4, all explicit: stable only while (damping dt + stiffness dt^2) / inertia stays below
-            2, and only for scenes without friction and velocity limits.
-        qdd: [world, dof], written with (qd' - qd) / dt of the semi-implicit step, the last substep, before it is
-            rounded into qd' and before the projection onto the closures.
-        status: int32 [world], written with one :class:`warp_spo.Status` for each world, of the semi-implicit step, the
-            worst that applies in any substep:
-
-            * 2, NOT_FINITE: an input, or a value of the scene, is NaN or infinite; infinite limits and bounds are none.
-            * 1, PIVOT: the result is not finite though the inputs are, as 1 and 4 in :meth:`forward_dynamics`. A
-              massless hinge without armature moves to where its forces cancel; it is NaN where no law can hold it, and
-              where its mass or armature is variable or differs between worlds.
-            * 6, LOOPS: the closures lose rank, or half of the dtype's digits, at a change point, see there.
-            * 7, OPEN: the closures are open after the step, or q' and qd' do not agree, by more than 1e-5 rad, 1e-5 of
-              the distance to the hinges that move the joint, or 1e-5 of the rates. The state stands, but Newton's steps
-              did not close it. Bars turn too far in the step (half a radian), which wants a shorter dt; or the step
-              started open, see :meth:`project`; or angles of many turns, or positions 100 m away, are rounded by as
-              much, which wants float64, angles without full turns, or an origin nearby.
-            * 8, CONTACT: the last pass of a scene with contacts ended outside of a friction cone, with a pulling
-              contact, or without the push of a point that it carried below ground, by more than 0.1 of the weight of
-              all bodies, or outside of an effort limit by more than 0.1 of the least such limit.
-            * 5, NOT_SETTLED: the last pass still found a law in another part than it had assumed; or, with four passes
-              and more, velocity terms of what it found changed a rate by a tenth of the largest one, because links turn
-              by much of a radian in the step. The step stands, with a force that a shorter dt would correct.
-            * 0, OK: none of these.
-
-        ctrl: controls of the scene's actuators [world, actuator]. None: the actuators do not act, servos neither.
-        actuator_state: the buffers of :meth:`actuator_state`, which the step changes. Needed where actuators delay
-            their controls; a scene without delays leaves them alone.
-        substeps: how many steps of ``dt`` to take, with the same forces, targets and controls: to the bit what as many
-            calls compute, each on the state that the one before returned. The time that passes is substeps dt. One
-            launch takes up to 1024 of them, and holds the state meanwhile; their number is no constant of the kernel.
-            Other integrators, loops="multipliers", pairs of bodies that touch, passes=4 and delays of actuators take
-            launches for each substep, see :meth:`explain`. Delays count substeps. With a tensor that requires grad,
-            every substep is recorded.
-        passes: of a scene with contacts; None: 3, or 4 where bodies touch each other. One is stable and coarse. From 4
-            on, where no bodies touch each other, energy hardly ever rises; that is three times the work of three.
-        contact_f: written with the force of the ground on each contact point [world, contact, 3] [N], inertial axes,
-            the mean over substeps. The points are ``scene.contact_points``; after them, for each of
-            ``scene.contact_pairs``, comes the force of the other body on the first one.
-        contact_gap: written with the distance of each point from the ground [world, contact] [m], negative inside, at
-            the q that the last substep starts from; of a pair at its deepest point, infinite where no faces meet.
-        contact_slip: written with the speed of each point along the ground after the step [world, contact] [m/s]; of a
-            pair that of its deepest point along the other body.
-        contact_excess: written with what the last pass of the last substep leaves [world, 3]: the largest friction
-            force beyond its cone and the largest pull of a contact [N], and the largest force of a drive beyond its
-            effort limit [N m or N].
-        contact_residual: of a scene with pairs of bodies, written with the largest change of a pair's force in the last
-            of 16 rounds, where pairs are solved in rounds [world] [N]; zero where they are solved exactly.
-        poses, velocities: written with :meth:`body_poses` and :meth:`body_velocities` of the state after the last
-            substep. With a warp for each of a quadruped's limbs, see :meth:`explain`, one kernel does both.
-        out: (q, qd) after the step, each an array or None. They may be the arrays of the state itself.
-
-    Returns:
-        q [world, coordinate], quaternions normalised, and qd [world, dof].
-    """
+    """Launch a step. The arguments are those of :func:`step`, with options and reports by their own names."""
     engine = self._engine
     with engine.call(STEP) as call:
         integrators.check_integrator(call, integrator, status=status, qdd=qdd)
@@ -317,6 +205,75 @@ def step(
         given = {name: value for name, value in given.items() if name not in StepArrays._fields}
         _launch(self, call, integrator, count, interval, given, buffers)
     return call.result
+
+
+@STEP.public
+def step(
+    self: Dynamics, q: ArrayT, qd: AnyArray, tau: AnyArray | None = None, dt: float = ..., *,
+    body_f: AnyArray | None = None, ctrl: AnyArray | None = None,
+    target_q: AnyArray | None = None, target_qd: AnyArray | None = None,
+    actuator_state: actuators.ActuatorState | None = None, options: StepOptions = DEFAULTS,
+    status: AnyArray | None = None, report: StepReport | None = None,
+    out: tuple[ArrayT | None, ArrayT | None] = (None, None),
+) -> tuple[ArrayT, ArrayT]:  # fmt: skip
+    """Compute the state after ``dt``: forward dynamics with the forces of all hinges, and q moved along the new qd.
+
+    Springs, dampers, drives, limits, dry friction, velocity limits, gravity compensation and actuators act on the
+    joints by the scene's values, and contacts on the bodies. These forces are implicit: they are those at the state
+    after the step, so that stiff ones are stable. :doc:`/theory` has their laws, and :doc:`/contacts` those of contacts
+    with the passes that find them. A force whose values are zero or unbounded in the scene generates no code.
+
+    Where Dynamics closes loops, accelerations obey the closures, and Newton steps then move q' and qd' onto them, see
+    :doc:`/closed_loops`. Contacts need the semi-implicit integrator, no closed loops, and another granularity than
+    "node".
+
+    Args:
+        q: coordinates [world, coordinate].
+        qd: velocities [world, dof].
+        tau: forces dual to qd [world, dof]; None means zero.
+        dt: length of the step [s], of each substep where there are several, the same in all worlds. It does not fold:
+            changing it compiles nothing.
+        body_f: as :meth:`forward_dynamics`.
+        ctrl: controls of the scene's actuators [world, actuator]. None: the actuators do not act, servos neither.
+        target_q: position targets of the drives [world, coordinate]; None means the neutral q.
+        target_qd: velocity targets of the drives [world, dof]; None means zero.
+        actuator_state: the buffers of :meth:`actuator_state`, which the step changes. Needed where actuators delay
+            their controls; a scene without delays leaves them alone.
+        options: :class:`StepOptions`: integrator, number of substeps, and passes of contacts.
+        status: int32 [world], written with one :class:`warp_spo.Status` for each world, of the semi-implicit step, the
+            worst that applies in any substep; :doc:`/theory` says what each means here.
+        report: :class:`StepReport`: further arrays that the step fills, such as accelerations and contact forces.
+        out: (q, qd) after the step, each an array or None. They may be the arrays of the state itself.
+
+    Returns:
+        q [world, coordinate], quaternions normalised, and qd [world, dof].
+
+    Raises:
+        TypeError: options or reports are given as arguments of their own.
+        ValueError, UnsupportedError: an argument does not fit, or the scene has no such step.
+    """
+    raise NotImplementedError  # never runs, see Operation.public
+
+
+def step_report(self: Dynamics, *names: str, like: Any = None) -> StepReport:
+    """Return new arrays, filled with zeros, for the reports of :meth:`step` with these names.
+
+    Args:
+        names: such as "qdd" and "contact_f", see :class:`StepReport`.
+        like: an array of the kind that the arrays are to have, such as q. None: Warp arrays.
+
+    Raises:
+        ValueError: there is no such report.
+    """
+    title = "Dynamics.step_report"
+    check_names(title, names)
+    axes = {one.name: one.axes for one in STEP.arrays if one.written}
+    kind = WARP if like is None else kind_of(like, title, "like")
+    with Call(title, self.device, self.dtype, kind=kind, call_order=self.recursions.call_order) as call:
+        for name in names:
+            launches.fill(call.write(None, *self._engine.shape(axes[name])), 0)
+    arrays = call.result if len(names) > 1 else [call.result] * len(names)
+    return StepReport(**dict(zip(names, arrays, strict=True)))
 
 
 def _read_if_given(dyn: Dynamics, call: Call, arrays: dict[str, Any]) -> dict[str, wp.array]:
