@@ -170,7 +170,7 @@ def trial_of(
     try:
         dyn = spo.Dynamics(scene, worlds, device, dtype, **options)
     finally:
-        plan.STRETCH = default
+        plan.BLOCK_LENGTH = default
     return TrialRun(Subject(dyn, inputs), FORWARD_DYNAMICS, min(SAMPLE, worlds)), dyn
 
 

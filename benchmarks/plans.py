@@ -144,7 +144,7 @@ def candidates(dyn: spo.Dynamics, operation: str) -> list[str]:
     """Return the granularities at which the operation can run, and that are worth timing."""
     routine = dyn._operations[operation].routine
     assert routine is not None
-    limbs = bool(routine.letters) and 1 < dyn.plan.leaf_segments <= 16
+    limbs = routine.segments is not None and bool(routine.segments.messages) and 1 < dyn.plan.leaf_segments <= 16
     return ["tree", *["segment"] * limbs, *["node"] * (routine.has_node_form and dyn.worlds <= NODE_WORLDS)]
 
 

@@ -11,7 +11,7 @@ from support.contact_cases import box, quadruped
 from warp_spo.dynamics.stepping.integrators import CONTACT_STEP
 from warp_spo.execution.builder import Builder
 from warp_spo.reference.dense import Dense
-from warp_spo.scene.contacts import NeutralPose
+from warp_spo.scene.contact_values import NeutralPose
 
 
 def of(body=0, **contact):

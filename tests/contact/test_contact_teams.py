@@ -216,8 +216,8 @@ def test_mirrored_legs_share_one_text():
 BUGS = {
     "a point that nobody takes": (points, "points_of", "first * each", "(first + 1) * each"),
     "a point that two take": (points, "points_of", "mine[each * len(segment.children) :]", "mine"),
-    "what a message leaves out": (Trace, "add_contacts", "z - self.contact_force[key]", "z"),
-    "excess of one limb": (step.ContactStepTrace, "_sent_to_the_first", "largest(list(values))", "values[0]"),
+    "what a message leaves out": (SegmentExchange, "add_contacts", "z - pushes[key]", "z"),
+    "excess of one limb": (step.ContactStepTrace, "_send_to_the_first", "largest(list(values))", "values[0]"),
     "no barrier after the passes": (pass_loops, "count_team_passes", '"}", barrier]', '"}"]'),
     "no barrier ahead": (warp_specialized.WarpSpecializedKernel, "_ahead", "[BARRIER] if stage else []", "[]"),
 }

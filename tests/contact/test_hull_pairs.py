@@ -17,7 +17,7 @@ from support.pair_touches import hull_of, planted, touches_found
 from warp_spo.kernels import hull_distance
 from warp_spo.reference import body_contact
 from warp_spo.reference.rotations import homogeneous
-from warp_spo.scene.collision_shapes import reduce_points
+from warp_spo.scene.extreme_points import farthest_points
 from warp_spo.scene.hulls import MOST
 
 
@@ -54,8 +54,8 @@ def test_flat_and_long_hulls_keep_all_corners_on_the_ground(monkeypatch):
         wanted = cloud[np.sort(ConvexHull(cloud).vertices)]
         np.testing.assert_array_equal(spo.Contact(0, hull=cloud).positions, wanted)
         few = cloud[:10]
-        np.testing.assert_array_equal(reduce_points(few, 16), np.sort(ConvexHull(few).vertices))  # of a file's mesh
-    monkeypatch.setattr("warp_spo.scene.contacts.AT_ONCE", 1000)
+        np.testing.assert_array_equal(farthest_points(few, 16), np.sort(ConvexHull(few).vertices))  # of a file's mesh
+    monkeypatch.setattr("warp_spo.scene.extreme_points.AT_ONCE", 1000)
     np.testing.assert_array_equal(spo.Contact(0, hull=cloud).positions, wanted)
 
 

@@ -27,9 +27,14 @@ def test_a_long_result_that_shared_memory_cannot_hold(granularity, device, monke
     assert {text.frame.result.way for text in texts} == {straight_line.RELAYED}
 
 
-@pytest.mark.parametrize("way", [straight_line.MAPPED, straight_line.RELAYED])
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("granularity", GRANULARITIES)
+@pytest.mark.parametrize(
+    ("granularity", "dtype", "way"),
+    slow_unless(
+        [("tree", "float32", straight_line.MAPPED), ("tree", "float64", straight_line.RELAYED),
+         ("segment", "float32", straight_line.RELAYED), ("segment", "float64", straight_line.MAPPED)],
+        itertools.product(GRANULARITIES, DTYPES, [straight_line.MAPPED, straight_line.RELAYED]),
+    ),
+)  # fmt: skip
 def test_long_results_that_begin_anywhere(granularity, dtype, way, device, monkeypatch):
     """Of worlds that fill no warp, no tile and no 16 bytes; nothing is written in front of the result or behind it."""
     operation = "mass_matrix" if granularity == "tree" else "mass_matrix_inverse"

@@ -78,7 +78,10 @@ def test_forward_dynamics_has_the_same_bits(device):
     plain = render(emitter.region(stores), "float32")
     rows = [shared_rows.SharedRow(name, 2, array.shape[1]) for name, array in given.items()]
     frame = straight_line.KernelLayout(
-        rows=rows, staged=False, fields=[], result=straight_line.ResultLayout(straight_line.DIRECT, rows[1]._replace(name="out")),
+        rows=rows,
+        staged=False,
+        fields=[],
+        result=straight_line.ResultLayout(straight_line.DIRECT, rows[1]._replace(name="out")),
         messages=0, warps=1, block=32)  # fmt: skip
     found = []
     for places in (0, 4, 40):

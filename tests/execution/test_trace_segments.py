@@ -9,7 +9,6 @@ import pytest
 import warp_spo as spo
 from support import laws, warp_machine, zoo
 from support.granularity_scenes import mirrored
-from support.segments_of_trees import TREES, hand
 from support.quick import slow_unless
 from support.robots import ROBOTS
 from support.routines import ROUTINES

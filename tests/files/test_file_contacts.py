@@ -13,7 +13,7 @@ import pytest
 import warp as wp
 
 import warp_spo as spo
-from warp_spo.scene.collision_shapes import reduce_points
+from warp_spo.scene.extreme_points import farthest_points
 
 EXACT = 1e-12  # float64 on both sides; sizes of a metre
 SINGLE = 3e-6  # MuJoCo keeps the vertices of meshes in float32
@@ -392,7 +392,7 @@ def test_reduced_hulls_keep_what_reaches_farthest():
     rng = np.random.default_rng(7)
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-2, 2) for z in (-3, 3.0)])
     cloud = np.concatenate([rng.uniform(-0.9, 0.9, (200, 3)) * [1, 2, 3], corners])
-    assert reduce_points(cloud, 8).tolist() == list(range(200, 208)) and reduce_points(cloud, 50).tolist() == list(
+    assert farthest_points(cloud, 8).tolist() == list(range(200, 208)) and farthest_points(cloud, 50).tolist() == list(
         range(200, 208)
     )
     ball = rng.normal(size=(500, 3))
@@ -400,7 +400,7 @@ def test_reduced_hulls_keep_what_reaches_farthest():
     directions = rng.normal(size=(200, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     missing = [
-        ((ball @ directions.T).max(0) - (ball[reduce_points(ball, n)] @ directions.T).max(0)).max()
+        ((ball @ directions.T).max(0) - (ball[farthest_points(ball, n)] @ directions.T).max(0)).max()
         for n in (4, 8, 16, 64)
     ]
     assert missing == sorted(missing, reverse=True) and missing[-1] < 0.06

@@ -11,7 +11,7 @@ import warp_spo as spo
 from benchmarks.table import cases
 from support import laws, oracles, symbolic, warp_machine, zoo
 from support.allocations import no_warp_allocation
-from support.segments_of_trees import TREES
+from support.quick import slow_unless
 from support.robots import ROBOTS
 from support.routines import ROUTINES
 from support.segments_of_trees import TREES

@@ -10,7 +10,7 @@ from support.mutants import mutant
 from support.routines import ROUTINES
 from warp_spo.execution.node import functions as node_functions
 from warp_spo.execution.node import sweeps
-from warp_spo.execution.segment import shared_code, warp_specialized
+from warp_spo.execution.segment import schedule, shared_code, warp_specialized
 from warp_spo.graph import blocks
 from warp_spo.kernels import straight_line
 from warp_spo.recursions import articulated, articulated_sweeps, mass_matrix_inverse, newton_euler
@@ -176,11 +176,12 @@ def team_error(monkeypatch, operation="forward_dynamics", name="star"):
 
 TEAM_MUTANTS = {
     "a slot too near": (messages, "offsets", "at += size(letter, segment)", "at += size(letter, segment) - 1"),
-    "no barrier before the trunk": (segments.Segments, "_hand_over",
-                                    "child.inward + (child.warp != segment.warp)", "child.inward"),
-    "no barrier after the trunk": (segments.Segments, "__init__",
-                                   "segment.parent.outward + (segment.warp != segment.parent.warp)",
-                                   "segment.parent.outward"),
+    "no barrier before the trunk": (schedule.Schedule, "_hand_over",
+                                    "inward[child.index] + (warp[child.index] != warp[segment.index])",
+                                    "inward[child.index]"),
+    "no barrier after the trunk": (schedule.Schedule, "_outward_stages",
+                                   "stages[above.index] + (self._warp[segment.index] != self._warp[above.index])",
+                                   "stages[above.index]"),
     "another limb's entries": (shared_code.SharedCode, "_distances", "who * {step}", "who * {step + 1}"),
     "another limb's constants": (shared_code.SharedCode, "merge", "zip(*constants.columns, strict=True)",
                                  "[*zip(*constants.columns, strict=True)][::-1]"),

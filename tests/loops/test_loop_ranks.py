@@ -9,6 +9,7 @@ import warp_spo as spo
 from support import laws, mechanisms, zoo
 from support.closed_loops import AGREE, DIFFERENCES, both, by_embedding, by_multipliers, flat, lagrange, traced
 from support.mechanisms import MECHANISMS, Closed
+from support.quick import slow_unless
 from warp_spo.dynamics.loop_analysis import ClosureEvaluator, _spanning, drawn, embedding
 from warp_spo.examples.parts import at, bar
 from warp_spo.recursions.loops.embedded import Embedding

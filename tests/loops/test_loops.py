@@ -18,6 +18,7 @@ from support.closed_loops import (
     traced,
 )
 from support.mechanisms import MECHANISMS, Closed
+from support.quick import slow_unless
 from warp_spo.dynamics.loop_analysis import ClosureEvaluator, embedding
 from warp_spo.recursions.loops import closures, clusters, embedded, nullspace
 from warp_spo.recursions.loops.projection import place_links

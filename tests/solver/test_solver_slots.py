@@ -166,7 +166,7 @@ def test_a_slider_does_not_turn():
 
 
 def test_models_that_have_no_slots():
-    assert float(newton_contact_slots.AWAY) == scene_contacts.AWAY
+    assert float(newton_contact_slots.AWAY) == ground.AWAY
     with pytest.raises(UnsupportedError, match="contacts of a model without shapes that stand still"):
         SolverSPO(boxes(None), contacts="pipeline")
     with pytest.raises(UnsupportedError, match="contacts='pipeline' with integrator='rk4'"):

@@ -15,10 +15,10 @@ from support.routines import ROUTINES
 from support.step_calls import bundled
 from support.step_scenes import FORCES, TOLERANCE, H, furnished, states
 from warp_spo.execution import plan
+from warp_spo.execution.segment import programs as segment_programs
 from warp_spo.execution.segment import warp_specialized
 from warp_spo.kernels import pass_loops, straight_line
 from warp_spo.kernels.substeps import repeat_on_cuda
-from warp_spo.recursions.step import step as steps
 from warp_spo.recursions.step.step import MOST_JOINT_SPACE_DOFS, Step, by_segments
 
 WORLDS = 4

@@ -62,11 +62,12 @@ def step(scene, a, h, passes):
     """q', qd' [world, ...] and the answers of all comparisons on the way [world, comparison]."""
     arguments = tuple(name for name in a if name not in VALUES)
     trace, worlds = trace_of(scene, (*arguments, "dt", "passes")), len(a["q"])
-    stores = contact_step.step(trace)
+    phases = contact_step.step(trace)
+    stores = phases.stores
     known = a | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
-    known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(trace.prologue)))}
+    known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(phases.prologue)))}
     known[GROUND] = cells_of(known)
-    answers = [store(trace.prologue, known, known)]
+    answers = [store(phases.prologue, known, known)]
     looped = [item for item in stores if item.array in (GAIN, SECANT)]
     for number in range(passes):
         known["pass"] = np.full((worlds, 1), float(number))

@@ -121,7 +121,7 @@ def contact_step(scene, arrays, h, passes=3, dtype="float64"):
     phases = contact.step(trace, True, True, contact.REPORTS)
     stores = phases.stores
     known = arrays | {"dt": np.full((worlds, 1), h), "passes": np.full((worlds, 1), float(passes))}
-    known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(trace.prologue)))}
+    known |= {GAIN: np.zeros((worlds, scene.dof_count)), SECANT: np.zeros((worlds, len(phases.prologue)))}
     known[GROUND] = by_cell(scene.ground.heights).ravel() if hasattr(scene.ground, "heights") else np.zeros(0)
 
     def stored(some, found):
@@ -130,7 +130,7 @@ def contact_step(scene, arrays, h, passes=3, dtype="float64"):
             found[item.array][(slice(None), *item.index)] = value
         return found
 
-    known |= stored(trace.prologue, {SECANT: known[SECANT]})
+    known |= stored(phases.prologue, {SECANT: known[SECANT]})
     looped = [item for item in stores if item.array in (GAIN, SECANT)]
     for number in range(passes):
         known["pass"] = np.full((worlds, 1), float(number))

@@ -9,7 +9,7 @@ import warp as wp
 
 from ..execution import status_words as words
 from ..execution.node import operations as node_operations
-from ..execution.routine import Routine
+from ..execution.routine import Routine, SegmentForm, TuningHints
 from ..recursions import forward_dynamics as recursion
 from ..recursions.derivatives import adjoints
 from ..recursions.loops import embedded_adjoints
@@ -67,14 +67,8 @@ FORWARD_DYNAMICS = Operation(
         "forward_dynamics",
         recursion.forward_dynamics,
         node_operations.forward_dynamics,
-        letters="Pza",
-        collects=True,
-        registers_when_spilling=168,
-        bias_first=Routine(
-            "forward_dynamics_apart",
-            recursion.forward_dynamics_bias_first,
-            node_operations.forward_dynamics,
-            letters="fPza",
+        segments=SegmentForm(messages="Pza"),
+        hints=TuningHints(
             collects=True,
             registers_when_spilling=168,
             bias_first=Routine(

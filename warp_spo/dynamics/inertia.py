@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..execution.node import operations as node_operations
-from ..execution.routine import Routine
+from ..execution.routine import Routine, SegmentForm, TuningHints
 from ..recursions import composite, determinant, forward_dynamics
 from ..recursions import mass_matrix_inverse as inverse
 from ..recursions.derivatives import adjoints
@@ -28,7 +28,13 @@ MASS_MATRIX = Operation(
     "mass_matrix",
     arguments=(Q,),
     results=(Result("mass", "world, independent dof, independent dof"),),
-    routine=Routine("mass_matrix", composite.mass_matrix, node_operations.mass_matrix, letters="R", long_result=True),
+    routine=Routine(
+        "mass_matrix",
+        composite.mass_matrix,
+        node_operations.mass_matrix,
+        segments=SegmentForm(messages="R"),
+        hints=TuningHints(long_result=True),
+    ),
     embed=Routine("embedded_mass_matrix", minimal.mass_matrix),
     multipliers=AS_WRITTEN,
     derivative=Derivative(Routine("mass_matrix_vjp", adjoints.mass_matrix_vjp), by=("q",)),
@@ -56,8 +62,8 @@ MASS_MATRIX_INVERSE = Operation(
         "mass_matrix_inverse",
         inverse.mass_matrix_inverse,
         node_operations.mass_matrix_inverse,
-        letters="PNDVY",
-        long_result=True,
+        segments=SegmentForm(messages="PNDVY"),
+        hints=TuningHints(long_result=True),
     ),
     embed=Routine("embedded_mass_matrix_inverse", minimal.mass_matrix_inverse),
     multipliers=AS_WRITTEN,
@@ -101,9 +107,8 @@ SOLVE_MASS_MATRIX = Operation(
         "solve_mass_matrix",
         forward_dynamics.solve_mass_matrix,
         node_operations.solve_mass_matrix,
-        letters="Pza",
-        velocities=False,
-        occupancy=((4, 128),),
+        segments=SegmentForm(messages="Pza"),
+        hints=TuningHints(velocities=False, occupancy=((4, 128),)),
     ),
     embed=Routine("embedded_solve_mass_matrix", minimal.solve_mass_matrix),
     multipliers=AS_WRITTEN,

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import UnsupportedError
 from ..execution.node import operations as node_operations
-from ..execution.routine import Routine
+from ..execution.routine import Routine, SegmentForm, TuningHints
 from ..recursions import newton_euler, reactions
 from ..recursions.derivatives import adjoints
 from ..recursions.loops import embedded_adjoints, minimal
@@ -70,14 +70,14 @@ RECURSION = Routine(
     "inverse_dynamics",
     newton_euler.inverse_dynamics,
     node_operations.inverse_dynamics,
-    letters="z",
-    short=True,
     title=_title,
     segments=SegmentForm(messages="z"),
     hints=TuningHints(short=True),
 )
 EMBEDDED_RECURSION = Routine("embedded_inverse_dynamics", minimal.inverse_dynamics)
-PULLBACK = Routine("inverse_dynamics_vjp", adjoints.inverse_dynamics_vjp, letters="B", divides=divides_backwards)
+PULLBACK = Routine(
+    "inverse_dynamics_vjp", adjoints.inverse_dynamics_vjp, segments=SegmentForm(messages="B", divides=divides_backwards)
+)
 EMBEDDED_PULLBACK = Routine("embedded_inverse_dynamics_vjp", embedded_adjoints.inverse_dynamics_vjp)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ..execution.node import operations as node_operations
-from ..execution.routine import Routine
+from ..execution.routine import Routine, SegmentForm
 from ..recursions import kinematics as recursion
 from ..recursions import reactions
 from ..recursions.derivatives import adjoints
@@ -108,7 +108,11 @@ BODY_STATES = Operation(
     arguments=(Q, required(QD)),
     results=(POSES, VELOCITIES),
     routine=Routine(
-        "body_states", recursion.body_states, node_operations.body_states, suits=_anchors_fixed, alone=True, wide=True
+        "body_states",
+        recursion.body_states,
+        node_operations.body_states,
+        suits=_anchors_fixed,
+        segments=SegmentForm(wide=True),
     ),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,

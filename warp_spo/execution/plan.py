@@ -8,7 +8,7 @@ import itertools
 from ..errors import UnsupportedError
 from ..kernels.long_results import WARP_SIZE
 from ..recursions.model.links import Links
-from ..recursions.model.segments import PARTS, Segments
+from ..recursions.model.segments import Segments
 from ..scene.scene import Scene
 from .device_facts import RESERVED, DeviceFacts
 from .node.path_blocks import decompose, solid_nodes
@@ -121,7 +121,7 @@ class Plan:
         """Return the granularity of one routine: the plan's own where the routine has that form."""
         if routine.name in self.tuned_plans:
             return self.tuned_plans[routine.name].of(routine)
-        if not routine.has_segment_form and not routine.has_node_form:
+        if routine.segments is None and not routine.has_node_form:
             return "tree"
         chosen = self.granularity if self.forced else self._rule(routine)
         if chosen == "segment":
@@ -131,17 +131,17 @@ class Plan:
     def _rule(self, routine: Routine) -> str:
         if self.granularity == "node" or self.leaf_segments == 1 or self.leaf_segments > MOST_WARPS:
             return self.granularity
-        if routine.couples:
+        if routine.couples_bodies:
             few = self.segments_share_code and self.worlds <= self.device.scaled(SHARED_CODE_WORLDS)
             return "segment" if few else "tree"
-        if routine.counted and not self.segments_share_code and self.dofs <= HELD:
+        if routine.is_counted and not self.segments_share_code and self.dofs <= HELD:
             return "tree"
         if (
             routine.hints.long_result or routine.passes is not None or routine.hints.crowded
         ):  # a thread holds too little even of a dozen dofs
             return "segment"
         if self.granularity == "segment" and not self.latency_bound:
-            if routine.short or (not routine.velocities and self.dofs <= SOLVES[self.dtype]):
+            if routine.hints.short or (not routine.hints.velocities and self.dofs <= SOLVES[self.dtype]):
                 return "tree"
         return self.granularity
 
@@ -154,7 +154,7 @@ class Plan:
         first = self.of(routine)
         if self.forced or self.dofs > MOST_DOFS or not self.dofs:
             return (first,)
-        divides = self.device.cuda and routine.has_segment_form and 1 < self.leaf_segments <= MOST_WARPS
+        divides = self.device.cuda and routine.segments is not None and 1 < self.leaf_segments <= MOST_WARPS
         sweeps = routine.has_node_form and not self.device.cuda and self.worlds <= NODE_WORLDS
         found = ["tree", *["segment"] * divides, *["node"] * sweeps]
         return (first, *(name for name in found if name != first))
@@ -190,7 +190,7 @@ class Plan:
 
         They come sooner, but the compiler then takes more registers; that costs nothing where all worlds run at once.
         """
-        suits = routine.short or routine.waits_late
+        suits = routine.hints.short or routine.hints.waits_late
         return (
             suits
             and not self.variable_inertia
@@ -204,28 +204,30 @@ class Plan:
         ``warps`` share 32 worlds; ``results`` is the number of results.
         """
         if warps > 1:
-            return self.worlds > WARP_SIZE if self.dofs > LONG_ROWS else routine.collects
-        return results > FEW_RESULTS or (not self.latency_bound and (self.variable_inertia or routine.short))
+            return self.worlds > WARP_SIZE if self.dofs > LONG_ROWS else routine.hints.collects
+        return results > FEW_RESULTS or (not self.latency_bound and (self.variable_inertia or routine.hints.short))
 
     def spill_slots(self, routine: Routine, shared_bytes: int, bytes_of: int, warps: int) -> int:
         """Return how many values each thread of a team sets aside in shared memory, to need fewer registers; 0: none.
 
-        As many as leave room for all the blocks that ``routine.registers_when_spilling`` registers allow. Measured on
-        an H200, 2026-11-23: G1 with variable inertias takes 841 us for 919 at 2^20 worlds. With folded ones, and with a
-        thread a world, the spills that they replace, or more registers, take less time.
+        As many as leave room for all the blocks that ``routine.hints.registers_when_spilling`` registers allow.
+        Measured on an H200, 2026-11-23: G1 with variable inertias takes 841 us for 919 at 2^20 worlds. With folded
+        ones, and with a thread a world, the spills that they replace, or more registers, take less time.
 
         Args:
             shared_bytes: of the block without these values. bytes_of: of a value. warps: of the team.
         """
         if (
-            not routine.registers_when_spilling
+            not routine.hints.registers_when_spilling
             or not self.variable_inertia
             or self.latency_bound
             or bytes_of > 4
             or self.dofs <= SPILLS["float32"]
         ):
             return 0
-        blocks = PARTS * (self.device.registers // PARTS // (WARP_SIZE * routine.registers_when_spilling)) // warps
+        blocks = (
+            PARTS * (self.device.registers // PARTS // (WARP_SIZE * routine.hints.registers_when_spilling)) // warps
+        )
         room = self.device.shared_bytes // max(blocks, 1) - 3 * RESERVED - shared_bytes  # Warp takes a share, too
         places = room // (WARP_SIZE * warps * bytes_of)
         return places if places >= LEAST_SPILL_SLOTS else 0
@@ -273,7 +275,7 @@ def choose(
     side_by_side = device.cuda and not shared and asked != "node" and 0 < scene.dof_count <= MOST_DOFS
     segments = Segments(Links(scene)) if side_by_side else None
     leaf_segments, segments_share_code = (
-        (segments.warps, segments.shared_code_fraction >= LEAST_SHARED_CODE[dtype]) if segments else (1, True)
+        (len(segments.leaves), segments.shared_code_fraction >= LEAST_SHARED_CODE[dtype]) if segments else (1, True)
     )
     serial = segments is not None and segments.longest_path_fraction >= SERIAL
     rule = _choose_by_rule(

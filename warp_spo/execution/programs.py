@@ -141,17 +141,17 @@ class Programs:
             return multi_start.build(self, routine, links, "given" in inputs, options)
         divides = routine.divides(self.run.scene, inputs, **options)
         shared = self.plan.of(routine) == "segment" and divides
-        if shared and routine.body_kinematics and self.builder.supports_body_kinematics:
+        if shared and routine.segments and routine.segments.body_kinematics and self.builder.supports_body_kinematics:
             return body_kinematics.build(self.builder, job, links)
-        if routine.bias_first is not None and self.plan.at(routine).bias_first and "qd" in inputs:
-            job = job._replace(routine=routine.bias_first)
+        if routine.hints.bias_first is not None and self.plan.at(routine).bias_first and "qd" in inputs:
+            job = job._replace(routine=routine.hints.bias_first)
         ways = [dict(alone=False)] if shared else []
         if routine.couples_bodies and divides and not coupled.suits(links):
             ways += [dict(alone=True), dict(alone=True, local=True)]
         segments = Segments(links) if ways else None
         for way in ways:
             assert segments is not None
-            if 1 < segments.warps <= MOST_WARPS or way["alone"]:
+            if 1 < len(segments.leaves) <= MOST_WARPS or way["alone"]:
                 program = segment_programs.build(self.builder, job, segments, **way)
                 if program is not None:
                     return program

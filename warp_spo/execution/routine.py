@@ -92,34 +92,9 @@ class Routine:
         sweeps: ``sweeps(run, out, **arrays)`` launches the same computation at node granularity; None: there is only
             the traced kernel of the scene.
         blocks: at node granularity the caller applies stored blocks instead of this routine.
-        letters: messages that segments send each other, see :mod:`warp_spo.recursions.model.messages`. "": they send
-            none.
-        alone: segments share the work without messages. Where they do not, and without letters, one thread works on a
-            whole world.
-        divides: ``divides(scene, inputs, **options)``, whether segments can share the work for these inputs and
-            options.
         suits: ``suits(links, shapes, **options)``, whether the traced kernel serves this scene; if not, the sweeps do.
-        short: the code is short, so that one thread holds a large tree without spilling registers.
-        velocities: the velocities of links are kept during the recursion, which takes registers.
-        long_result: writing the result is most of the work, and many warps write faster.
-        collects: by segments, short rows of the result leave through shared memory.
-        passes: the recursion is repeated until the laws of the joints hold, and its results may overwrite its inputs.
-        counted: so often as the argument "passes" says.
-        crowded: a thread holds too little even of a dozen dofs, so that segments share the work with many worlds, too.
-        couples: by segments, native code couples pairs of bodies between their sweeps.
-        tiled: the result is left in tiles for the kernels of :mod:`warp_spo.kernels.tiles` to finish.
-        bias_first: variant that computes velocity terms and loads first, for many worlds of shallow trees.
-        occupancy: pairs (blocks, registers): by segments in float32 with many worlds, a multiprocessor holds so many
-            blocks if a thread then still has so many registers; the first pair that applies.
-        waits_late: with a thread a world, where all worlds run at once, a block has two warps, and they wait for a row
-            where they first use it.
-        registers_when_spilling: by segments, with many worlds and variable inertias, registers of a thread that keeps
-            values in shared memory while nothing uses them, see :mod:`..trace.register_spilling`; 0: it keeps none.
-        variants: at most so many different options get a kernel of their own where sweeps serve the others.
-        wide: its rows are long, so that a team asks for as much shared memory as they need.
         start: ``start(trace, **options)`` returns what a search starts from; None: the kernel is no search, see
-            :mod:`.searches`.
-        body_kinematics: by segments, one loop over table rows serves bodies, see :mod:`.segment.body_kinematics`.
+            :mod:`.multi_start`.
         title: ``title(inputs, **options)``, what a user calls this computation; None: the name.
         variants: at most so many different options get a kernel of their own where sweeps serve the others.
         segments: how segments share the work; None: one thread works on a whole world.
@@ -132,23 +107,7 @@ class Routine:
     sweeps: Callable[..., None] | None = None
     blocks: bool = False
     suits: Callable[..., bool] = _always
-    short: bool = False
-    velocities: bool = True
-    long_result: bool = False
-    collects: bool = False
-    passes: bool = False
-    counted: bool = False
-    crowded: bool = False
-    couples: bool = False
-    tiled: bool = False
-    bias_first: Routine | None = None
-    occupancy: tuple[tuple[int, int], ...] = ()
-    waits_late: bool = False
-    registers_when_spilling: int = 0
-    variants: int = VARIANTS
-    wide: bool = False
     start: Callable[..., list[Store]] | None = None
-    body_kinematics: bool = False
     title: Callable[..., str] | None = None
     variants: int = VARIANTS
     segments: SegmentForm | None = None
@@ -160,9 +119,14 @@ class Routine:
         return self.segments is not None and self.segments.divides(*args, **options)
 
     @property
-    def has_segment_form(self) -> bool:
-        """Whether segments can share the work."""
-        return bool(self.letters) or self.alone
+    def couples_bodies(self) -> bool:
+        """Whether native code couples pairs of bodies between the sweeps of segments."""
+        return self.segments is not None and self.segments.couples_bodies
+
+    @property
+    def is_counted(self) -> bool:
+        """Whether an argument says how many passes are made."""
+        return self.passes is not None and self.passes.counted
 
     @functools.cached_property
     def has_node_form(self) -> bool:

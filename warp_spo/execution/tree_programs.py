@@ -35,22 +35,22 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
     looped = [item for item in stores if item.array in (*PASSED, coupled.TWIST)]
     aggregates = any(item.array == coupled.TWIST for item in stores)
     kept = (
-        [Store("ahead", (), value) for value in trace.pass_invariants] if looped else []
+        [Store("ahead", (), value) for value in phases.pass_invariants] if looped else []
     )  # may read what no store needs
-    layout = builder.layout(job, outs, trace.prologue + stores + kept)
-    once = routine.passes or any(item.array in LOOPED for item in stores)  # may write over what it reads
+    layout = builder.layout(job, outs, phases.prologue + stores + kept)
+    once = routine.passes is not None or any(item.array in LOOPED for item in stores)  # may write over what it reads
     layout = layout._replace(retries=not once and not layout.staged and layout.result.way in (DIRECT, TILED, RELAYED))
     placed, table = staging.arrange_stores(outs, layout.result)
     placed += apart
     emitter = make_emitter(dtype, shapes, layout, branches=aggregates)
     responses = [item for item in stores if item.array in pairs.READ]
-    regions = [emitter.region(trace.prologue, trace.pass_invariants)] if looped else []
+    regions = [emitter.region(phases.prologue, phases.pass_invariants)] if looped else []
     regions += emitter.branches([responses, looped] if responses else [looped]) if looped else []
     *before, body = (render(each, dtype) for each in [*regions, emitter.region(placed)])
     tables: dict[str, Any] = {} if table is None else {"place": table}
     tables |= builder.height_tables(emitter.counts["lookup"] > 0)
-    if trace.prologue:
-        entries = {GAIN: run.scene.dof_count, SECANT: max(1, sum(item.array == SECANT for item in trace.prologue))}
+    if phases.prologue:
+        entries = {GAIN: run.scene.dof_count, SECANT: max(1, sum(item.array == SECANT for item in phases.prologue))}
         if responses:
             couples = _couples(links)
             entries |= coupling.shared_arrays(couples)
@@ -64,7 +64,7 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
         ahead, a_pass = before
         body = pass_loops.repeat_passes(ahead, a_pass, body, LOOPED, run.scene.dof_count, run.dtype)
     direct = layout.staged and plan.copies_directly(routine)
-    late = direct and routine.waits_late
+    late = direct and routine.hints.waits_late
     block = PAIR * WARP_SIZE if late or (plan.latency_bound and not layout.shared_scalars) else WARP_SIZE
     layout = layout._replace(retries=layout.retries and "farthest" in body, block=block, direct=direct, late=late)
     cuda = cpu = body

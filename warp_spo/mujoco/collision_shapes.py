@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 
 from ..scene.collision_shapes import CollisionShape
-from ..scene.contacts import HeightField
+from ..scene.contact_shapes import SHAPES, kinds_in
+from ..scene.ground import HeightField
 from .mechanism import xyzw
 from .source import Source
 

@@ -14,7 +14,7 @@ from ..errors import UnsupportedError
 from ..kernels import declare
 from ..kernels import newton_contacts as kernels
 from ..scene.collision_shapes import ShapeSelection, moving_bodies
-from ..scene.contacts import HEIGHTS
+from ..scene.ground import HEIGHTS
 from ..scene.scene import Scene
 from ..status import Status
 from .elevations import Elevations

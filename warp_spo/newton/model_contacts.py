@@ -14,7 +14,9 @@ from newton import GeoType, ShapeFlags
 
 from ..errors import UnsupportedError
 from ..scene.collision_shapes import AXIS_TOLERANCE, CollisionShape, SelectedContacts, ShapeSelection
-from ..scene.contacts import HeightField, pose_matrix
+from ..scene.contact_shapes import SHAPES, kinds_in
+from ..scene.frames import pose_matrix
+from ..scene.ground import HeightField
 from ..scene.scene import Scene
 from .elevations import Fields
 from .worlds import WorldRows, to_numpy, unit_pose

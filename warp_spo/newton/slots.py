@@ -22,8 +22,8 @@ from .model_contacts import ModelShapes
 from .pairs import ModelPairs
 from .worlds import WorldRows
 
-MOST_SLOTS = {"sphere": 4, "capsule": 4}
-"""Slots at most of shapes that touch in few points."""
+SWEPT_SLOTS = 4
+"""Slots at most of spheres and capsules, which touch in few points."""
 SLOT_VALUES = ("contact_place", "contact_friction", "contact_stiffness", "contact_damping")
 """Values of the scene that the contacts of a step are."""
 
@@ -56,7 +56,8 @@ class ContactSlots:
         for column, shape in enumerate(shapes.first()[: shapes.rows.shape[1]]):
             if shape.body < 0 or not moving[shape.body]:
                 continue
-            count = min(points, MOST_SLOTS.get(shape.kind, points))
+            few = shape.kind in SHAPES and SHAPES[shape.kind].swept
+            count = min(points, SWEPT_SLOTS) if few else points
             contacts += [Contact(shape.body, point=shape.pose[:3], label=shape.label)] * count
             columns, counts = [*columns, column], [*counts, count]
         still = [shape for shape in shapes.first() if shape.body < 0 or not moving[shape.body]]

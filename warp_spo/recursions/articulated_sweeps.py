@@ -49,7 +49,7 @@ def eliminate(
 ) -> None:
     """Add the factor of a link to ``done``, and P+ in its parent's frame to ``inner``, after its children's."""
     trace.label(link, "P")
-    carried = trace.from_children(link, "P", inner, Articulated.unpacked)
+    carried = trace.exchange.from_children(link, "P", inner, Articulated.unpacked)
     if id(link) in trace.contact_inertia:
         carried = [*carried, trace.contact_inertia[id(link)]]
     if link.shared_dofs is not None:
@@ -96,6 +96,7 @@ def reduce(
     Args:
         tau: force of a dof. moves: links have velocities. loads: subtract the external wrenches.
         letters: of the messages to other segments; "P" among them sends the articulated inertias.
+        phases: receives what does not change from pass to pass, where passes repeat the sweep.
     """
     done: Factors = {}
     rates: dict[int, list[Value]] = {}
@@ -114,11 +115,12 @@ def reduce(
         z = articulated.gyroscopic(link.inertia, move)
         if loads:
             z = z - trace.external_wrench(link)
-        bias = *move.bias_w, *move.bias_v, *move.bias_l
-        trace.pass_invariants += [*(place.pose.turn or ()), *bias, *z]  # the passes of a step share them
+        if phases is not None:
+            bias = *move.bias_w, *move.bias_v, *move.bias_l
+            phases.add_invariants([*(place.pose.turn or ()), *bias, *z])
         if key in trace.contact_force:
             z = z - trace.contact_force[key]
-        for force in trace.from_children(link, letters[-1], forces, Vector):
+        for force in trace.exchange.from_children(link, letters[-1], forces, Vector):
             z = z + force
         if link.shared_dofs is None:
             right = [tau(dof) for dof in link.dofs]
@@ -130,9 +132,11 @@ def reduce(
                 rates[leader], _, forces[key] = shared_dofs.reduce(
                     done[leader], trace.places, trace.motions, waiting, right
                 )
-        carried, force = trace.add_contacts(link, inner[key], forces[key])
-        stores += trace.send_to_parent("P", link, carried.packed) if "P" in letters else []
-        stores += trace.send_to_parent(letters[-1], link, force)
+        carried, force = trace.exchange.add_contacts(
+            link, inner[key], forces[key], trace.contact_inertia, trace.contact_force
+        )
+        stores += trace.exchange.send_to_parent("P", link, carried.packed) if "P" in letters else []
+        stores += trace.exchange.send_to_parent(letters[-1], link, force)
     return done, rates, stores
 
 
@@ -160,7 +164,8 @@ def expand(
         elif trace.exchange.own(link.parent):
             above = alpha[id(link.parent)]
         else:
-            received = trace.receive(letter, trace.segment.parent)  # type: ignore[union-attr, arg-type]
+            assert trace.exchange.parent is not None
+            received = trace.exchange.receive(letter, trace.exchange.parent)
             above = alpha[id(link.parent)] = Vector(received[:3]), Vector(received[3:])
         place, move = trace.places[key], trace.motions[key]
         if link.shared_dofs is None:
@@ -172,8 +177,7 @@ def expand(
             if not link.is_leader:
                 continue
         stores += [Store(name, (dof,), value) for dof, value in zip(link.dofs, qdd, strict=True)]
-        if trace.segment is not None and trace.segment.children and link is trace.segment.links[-1]:
-            stores += trace.send(letter, trace.segment, (*alpha[key][0], *alpha[key][1]))
+        stores += trace.exchange.send_to_children(letter, link, (*alpha[key][0], *alpha[key][1]))
     return stores
 
 

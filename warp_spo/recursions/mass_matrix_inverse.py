@@ -15,7 +15,7 @@ from ..trace.spatial import Vector, dot, total
 from . import articulated
 from .articulated_sweeps import NO_FORCE, factor, factor_tree, mirror, pack, pivots, propagate_inward, weighted_products
 from .model.links import Link
-from .model.segments import Segment, Segments
+from .model.segments import Segment
 from .motion import STILL
 from .step.phases import PhaseBuilder, StepPhases
 
@@ -36,7 +36,7 @@ class Inverse:
     """
 
     def __init__(self, trace: Trace):
-        self.trace, self.segments = trace, Segments(trace.links).all
+        self.trace, self.segments = trace, trace.exchange.segments
         self.entries: dict[tuple[int, int], Value] = {}
         self.shared_entries: list[dict[tuple[int, int], Value]] = []
         self.done, self.stores = factor(trace)
@@ -44,7 +44,7 @@ class Inverse:
         self._rates: dict[int, list[Value]] = {}  # the part of Y_j in j's own segment
         self._forces: dict[int, Vector] = {}  # F_j
         self._columns: dict[int, list[Value]] = {}  # Y_j
-        own = [segment for segment in self.segments if trace.segment is None or segment.index == trace.segment.index]
+        own = trace.exchange.own_segments
         for segment in own:
             for at, link in enumerate(segment.links):
                 for i, dof in enumerate(link.dofs):
@@ -73,15 +73,15 @@ class Inverse:
         """Complete the columns of a segment and multiply them with each other."""
         trace = self.trace
         further = [one for one in reversed(segment.ancestors)]
-        N = [] if segment.parent is None else _sixes(trace.receive("N", segment.parent))
-        D = [d for one in further for d in trace.receive("D", one)]
+        N = [] if segment.parent is None else _sixes(trace.exchange.receive("N", segment.parent))
+        D = [d for one in further for d in trace.exchange.receive("D", one)]
         D += [pivot.D for link in segment.links for pivot in self.done[id(link)].pivots]
         for j in segment.dofs:
             trace.graph.step = f"column {j}|y"
             self._columns[j] = [dot(row, self._forces[j]) for row in N] + self._rates[j]
         if any(other.computes_shared_entries_with(segment) for other in self.segments):
             heads = (self._columns[j][: len(N)] for j in segment.dofs)
-            self.final_messages += trace.send("Y", segment, [x for head in heads for x in head])
+            self.final_messages += trace.exchange.send("Y", segment, [x for head in heads for x in head])
         weighted = {j: [d * y for d, y in zip(D, self._columns[j], strict=False)] for j in segment.dofs}
         for at, j in enumerate(segment.dofs):
             trace.graph.step = f"column {j}|m"
@@ -95,18 +95,22 @@ class Inverse:
         for c in range(6):
             rates, force = self._inward(segment.links, Vector(float(i == c) for i in range(6)), still)
             columns.append([dot(row, force) for row in N] + rates)
-        self.stores += trace.send("N", segment, [x for row in zip(*columns, strict=True) for x in row])
-        self.stores += trace.send("D", segment, D[len(N) :])
+        self.stores += trace.exchange.send("N", segment, [x for row in zip(*columns, strict=True) for x in row])
+        self.stores += trace.exchange.send("D", segment, D[len(N) :])
         rest = {j: [0.0] * (len(D) - len(self._columns[j])) for j in segment.dofs}
-        self.stores += trace.send("V", segment, [x for j in segment.dofs for x in self._columns[j] + rest[j]])
+        self.stores += trace.exchange.send("V", segment, [x for j in segment.dofs for x in self._columns[j] + rest[j]])
 
     def _meet(self, segment: Segment, other: Segment) -> None:
         """Compute the entries of two branches, or of a branch and one that carries it, over shared pivots."""
         common_ancestor = segment.common_ancestor(other)
         assert common_ancestor is not None
         common = len(common_ancestor.all_dofs)
-        D = [d for one in reversed([common_ancestor, *common_ancestor.ancestors]) for d in self.trace.receive("D", one)]
-        sent = self.trace.receive("V" if common_ancestor is other else "Y", other)
+        D = [
+            d
+            for one in reversed([common_ancestor, *common_ancestor.ancestors])
+            for d in self.trace.exchange.receive("D", one)
+        ]
+        sent = self.trace.exchange.receive("V" if common_ancestor is other else "Y", other)
         length = len(sent) // other.dof_count
         for at, i in enumerate(other.dofs):
             self.trace.graph.step = f"column {i}|m"
@@ -125,13 +129,20 @@ def _sixes(values: list[Value]) -> list[list[Value]]:
 
 def mass_matrix_inverse(trace: Trace) -> list[Store] | StepPhases:
     """out = Mass^-1, both triangles"""
-    if trace.links.shares_dofs:
-        return by_columns(trace)
+    if trace.exchange.alone:
+        return by_columns(trace) if trace.links.shares_dofs else _by_segments(trace)
+    inverse, phases = Inverse(trace), PhaseBuilder()
+    for entries in inverse.shared_entries:
+        phases.add_final_stores(mirror(entries))
+    phases.add_final_messages(inverse.final_messages)
+    phases.add_sweep(inverse.stores + mirror(inverse.entries))
+    return phases.phases
+
+
+def _by_segments(trace: Trace) -> list[Store]:
+    """out = Mass^-1, both triangles, where one evaluation takes all segments"""
     inverse = Inverse(trace)
-    shared_entries = [mirror(entries) for entries in inverse.shared_entries]
-    if trace.segment is not None:
-        trace.final_stores, trace.final_messages, shared_entries = shared_entries, inverse.final_messages, []
-    return inverse.stores + mirror(inverse.entries) + [item for stores in shared_entries for item in stores]
+    return mirror(inverse.entries) + [item for entries in inverse.shared_entries for item in mirror(entries)]
 
 
 def by_columns(trace: Trace) -> list[Store]:

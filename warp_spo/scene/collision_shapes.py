@@ -16,8 +16,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..errors import UnsupportedError, as_integer
-from .contacts import Contact, HeightField, NeutralPose, Plane, pose_matrix, spread_directions
-from .hulls import farthest_beyond
+from .contact_shapes import SHAPES, ContactShape, Placement
+from .contact_values import NeutralPose
+from .contacts import Contact
+from .frames import pose_matrix
+from .ground import HeightField, Plane
 
 if TYPE_CHECKING:
     from .scene import Scene
@@ -64,6 +67,10 @@ class CollisionShape:
     names: tuple[str, ...] = ()
     index: int = -1
     triangles: Any = None
+
+    def contact_shape(self, clean: bool = False) -> ContactShape:
+        """Return the geometry of a shape whose kind is one of ``KINDS``; ``clean`` as of :class:`Placement`."""
+        return SHAPES[self.kind].from_sizes(self.sizes, Placement(self.pose, clean))
 
     def with_mean_material(self, ground_shape: CollisionShape | None) -> CollisionShape:
         """Return the shape with the means of its material and that of the ground, where both have one."""
@@ -243,102 +250,14 @@ def moving_bodies(scene: Scene) -> np.ndarray:
     return moving
 
 
-# -- points ------------------------------------------------------------------------------------------------------------
+# -- contacts ----------------------------------------------------------------------------------------------------------
 def contacts_of(shape: CollisionShape, most: int = POINTS) -> list[Contact]:
     """Return the contacts that stand for a shape, none for one that has no points."""
     values: dict[str, Any] = {"stiffness": shape.stiffness, "damping": shape.damping, "label": shape.label}
     if shape.friction is not None:
         values["friction"] = shape.friction
-    if shape.kind == "sphere":
-        return [Contact(shape.body, sphere=(place[:3, 3], shape.sizes[0] + shape.rounding), **values)]
-    if shape.kind == "capsule":
-        radius, half = shape.sizes
-        ends = at([[0.0, 0.0, half], [0.0, 0.0, -half]])
-        return [Contact(shape.body, capsule=(*ends, radius + shape.rounding), **values)]
-    if shape.kind == "box" and not shape.rounding:
-        return [Contact(shape.body, box=(shape.sizes, shape.pose), **values)]
-    points = at(KINDS[shape.kind](shape.sizes, most))
-    if not shape.rounding:
-        return [Contact(shape.body, hull=points, **values)] if len(points) else []
-    return [Contact(shape.body, sphere=(point, shape.rounding), **values) for point in points]
-
-
-def _place(points: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return points where a pose puts them, with zeros where entries are zero but for rounding: zeros cost nothing."""
-    found = points @ place[:3, :3].T + place[:3, 3]
-    size = max(np.abs(points).max(initial=0.0), np.abs(found).max(initial=0.0))
-    return np.where(np.abs(found) <= ROUNDING * size, 0.0, found)
-
-
-def _box(half: Any, most: int) -> np.ndarray:
-    return np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * np.asarray(half)
-
-
-def _cylinder(sizes: Any, most: int) -> np.ndarray:
-    """Return points on both rims, as many on one as on the other, evenly spread."""
-    radius, half = sizes
-    ring = _ring(max(1, most // 2), radius)
-    return np.concatenate([ring + np.array([0.0, 0.0, z]) for z in (half, -half)])
-
-
-def _cone(sizes: Any, most: int) -> np.ndarray:
-    """Return the tip, at +z, and points on the rim."""
-    radius, half = sizes
-    tip = np.array([0.0, 0.0, half])
-    return np.concatenate([tip[None], _ring(max(1, most - 1), radius) - tip])
-
-
-def _ring(count: int, radius: float) -> np.ndarray:
-    angles = 2.0 * np.pi * np.arange(count) / count
-    return radius * np.stack([np.cos(angles), np.sin(angles), np.zeros(count)], axis=1)
-
-
-def _ellipsoid(axes: Any, most: int) -> np.ndarray:
-    axes = np.asarray(axes, dtype=np.float64)
-    return _hull(axes * np.concatenate([np.eye(3), -np.eye(3), spread_directions(SPREAD)]), most)
-
-
-def _hull(points: Any, most: int) -> np.ndarray:
-    points = np.asarray(points, dtype=np.float64)
-    return points[reduce_points(points, most)] if len(points) else np.zeros((0, 3))
-
-
-KINDS: dict[str, Any] = {
-    "sphere": None,
-    "capsule": None,
-    "box": _box,
-    "cylinder": _cylinder,
-    "cone": _cone,
-    "ellipsoid": _ellipsoid,
-    "hull": _hull,
-}
-"""Kinds of shapes that have points, and how they are found where it takes more than their sizes."""
-
-
-def reduce_points(points: np.ndarray, most: int) -> np.ndarray:
-    """Return the indices, ascending, of at most so many points whose hull comes near that of all.
-
-    Each further point is the one that the hull of those before misses most, in one of many directions: what a plane
-    would sink into the body before it touches. Where several are as far, the first counts, so that the choice does not
-    depend on rounding. Last come corners that are farthest in none of these directions.
-    """
-    outward = np.concatenate([-np.eye(3), np.eye(3), spread_directions()])  # downward directions before others
-    outward = outward[[2, 5, 0, 1, 3, 4, *range(6, len(outward))]]
-    heights = (points - points.mean(axis=0)) @ outward.T
-    far, reach = heights.argmax(axis=0), heights.max(axis=0)
-    size = float(np.ptp(points, axis=0).max())
-    chosen = [int(far[0])]
-    covered = heights[chosen[0]].copy()
-    while len(chosen) < most:
-        missing = reach - covered
-        worst = int(np.argmax(missing > missing.max() - 1e-9 * size))
-        if missing[worst] <= 1e-9 * size:
-            break
-        chosen.append(int(far[worst]))
-        covered = np.maximum(covered, heights[chosen[-1]])
-    while len(chosen) < most and (left := farthest_beyond(points, np.unique(chosen))) is not None:
-        chosen.append(left)
-    return np.unique(chosen)
+    found = shape.contact_shape(clean=True).on_ground(shape.rounding, most)
+    return [Contact(shape.body, **one.arguments(), **values) for one in found]
 
 
 # -- grounds -----------------------------------------------------------------------------------------------------------

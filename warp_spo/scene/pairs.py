@@ -12,36 +12,6 @@ from .contact_shapes import ConvexShape, as_pair, most_points
 
 STATIC_SINK = 1e-4  # how far the lighter body sinks in [m] that rests on the other one, where the stiffness is chosen
 DAMPING = 2.0  # of sqrt(k m): critical, so that stacks come to rest
-FACE = 8  # corners at most of the common part of two rectangles
-FACES = 16  # corners at most of a face of one hull and one of another together
-PART = 4  # ends of the part of a segment that is near a box or a hull
-SWEPT_SEGMENT, BOX, HULL = 0, 1, 2
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class ConvexShape(StoredPart):
-    """A convex shape of a body.
-
-    Attributes:
-        kind: BOX, HULL, or ROUND: all points within ``radius`` of a segment, which is a point for spheres.
-        pose: of the box, of the hull's middle, or of the segment's middle with the segment along z, in the body [7].
-        size: half the sizes of the box, or of the one around the hull [m]; (0, 0, half the length) of the segment.
-        radius: [m]; 0 of boxes, hulls and points.
-        hull: the corners and faces of a hull, about its pose.
-    """
-
-    kind: int
-    pose: np.ndarray
-    size: np.ndarray
-    radius: float
-    hull: Hull | None = None
-
-    @property
-    def samples(self) -> np.ndarray:
-        """Points on the surface, or near it, in the body frame [point, 3] [m]."""
-        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        local = signs * (self.size + self.radius / np.sqrt(3.0))
-        return local @ _rotation(self.pose[3:]).T + self.pose[:3]
 
 
 class ContactPair(NamedTuple):
@@ -83,35 +53,9 @@ def contact_pairs(contacts: Sequence[Any], bodies: Sequence[Any]) -> tuple[Conta
             raise ValueError(f"{call} is of body {body} with itself; expected two bodies")
         if other >= 0 and bodies[other].modes is not None:
             raise UnsupportedError(call, "a contact with a body with modes", "let it touch a rigid body")
-        both = shape_of(call, contact), shape_of(call, partner)
-        if SWEPT_SEGMENT not in (kinds := {one.kind for one in both}) and HULL in kinds:
-            both = as_hull(call, both[0]), as_hull(call, both[1])
+        both = as_pair(call, contact.shape.convex(call), partner.shape.convex(call))
         found.append(ContactPair(index, body, other, both, most_points(call, *both), contact.eps))
     return tuple(found)
-
-
-def most_points(call: str, first: ConvexShape, second: ConvexShape) -> int:
-    """Return how many points two shapes share at most; UnsupportedError if these are more than native code takes."""
-    if first.hull is not None and second.hull is not None:
-        corners = sum(max(map(len, one.hull.faces)) for one in (first, second) if one.hull is not None)
-        if corners > FACES:
-            raise UnsupportedError(
-                call, f"two hulls whose largest faces have {corners} corners together, more than {FACES},",
-                "give fewer points around the largest faces, or spheres in place of one of the two",
-            )  # fmt: skip
-        return corners
-    if SWEPT_SEGMENT not in (first.kind, second.kind):
-        return FACE
-    has_capsule = max(one.size[2] for one in (first, second) if one.kind == SWEPT_SEGMENT) > 0.0
-    return PART if has_capsule and {first.kind, second.kind} != {SWEPT_SEGMENT} else 1
-
-
-def as_hull(call: str, shape: ConvexShape) -> ConvexShape:
-    """Return a box as the hull of its corners, and a hull as it is."""
-    if shape.hull is not None:
-        return shape
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * shape.size
-    return dataclasses.replace(shape, kind=HULL, hull=convex_hull(call, corners, corners)[0])
 
 
 def _partner(call: str, contact: Any, contacts: Sequence[Any]) -> Any:
@@ -130,23 +74,6 @@ def _partner(call: str, contact: Any, contacts: Sequence[Any]) -> Any:
             f"it takes; or pass other=spo.Contact({body}, box=...)"
         )
     return own[0]
-
-
-def shape_of(call: str, contact: Any) -> ConvexShape:
-    """Return the shape of a contact."""
-    places, radius = contact.positions, contact.radius
-    if contact.hull is not None:
-        hull, middle = convex_hull(call, real(contact.hull), places)
-        pose = np.array([*middle, 0.0, 0.0, 0.0, 1.0])
-        return ConvexShape(HULL, read_only(pose), read_only(np.ptp(hull.corners, axis=0) / 2.0), 0.0, hull)
-    if contact.box is not None:
-        pose, size = contact.frame
-        return ConvexShape(BOX, pose, size, 0.0)
-    half = (places[-1] - places[0]) / 2.0
-    length = float(np.linalg.norm(half))
-    turn = (0.0, 0.0, 0.0, 1.0) if length == 0.0 else _from_z(half / length)
-    pose = np.concatenate([(places[-1] + places[0]) / 2.0, turn])
-    return ConvexShape(SWEPT_SEGMENT, read_only(pose), read_only(np.array([0.0, 0.0, length])), radius)
 
 
 def pair_values(pair: ContactPair, scene: Any, neutral: Any) -> tuple[float, float, float]:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import UnsupportedError, as_integer
 from .collision_shapes import CollisionShape
-from .contacts import Contact, pose_matrix, spread_directions
-from .hulls import Hull, convex_hull, grown, is_convex
+from .contact_shapes import SHAPES, ContactShape
+from .contacts import Contact
 
 if TYPE_CHECKING:
     from .scene import Scene
@@ -44,7 +44,7 @@ class ShapePair(NamedTuple):
     def contact(self) -> Contact:
         """Return the contact that stands for the pair, with the means of the shapes' materials."""
         a, b = self.first.with_mean_material(self.second), self.second
-        solids = [_contact_arguments(one, other) for one, other in ((a, b), (b, a))]
+        solids = [_with_margins(one, other).arguments() for one, other in ((a, b), (b, a))]
         material = {name: getattr(a, name) for name in ("stiffness", "damping")}
         if a.friction is not None:
             material["friction"] = a.friction
@@ -56,23 +56,11 @@ class ShapePair(NamedTuple):
         return " with ".join(shape.words(bodies) for shape in self)
 
 
-def _contact_arguments(shape: CollisionShape, other: CollisionShape) -> dict[str, Any]:
-    """Return a shape as arguments of a Contact with another one.
-
-    A margin makes a box or a hull larger on all sides; that of a hull the sphere or capsule which it meets.
-    """
-    place, more = pose_matrix(shape.pose), other.rounding if other.kind == "hull" else 0.0
-    if shape.kind == "sphere":
-        return {"sphere": (place[:3, 3], shape.sizes[0] + shape.rounding + more)}
-    if shape.kind == "hull":
-        hull, middle = _hull_of(shape)
-        corners = grown(hull, shape.rounding) if other.kind in ("box", "hull") and shape.rounding else hull.corners
-        return {"hull": (corners + middle) @ place[:3, :3].T + place[:3, 3]}
-    if shape.kind == "capsule":
-        radius, half = shape.sizes
-        ends = (place[:3, 3] + side * half * place[:3, 2] for side in (1.0, -1.0))
-        return {"capsule": (*ends, radius + shape.rounding + more)}
-    return {"box": (np.asarray(shape.sizes) + shape.rounding, shape.pose)}
+def _with_margins(shape: CollisionShape, other: CollisionShape) -> ContactShape:
+    """Return a shape as it meets another one, larger by its margin and by that which the other one lends."""
+    own, met = shape.contact_shape(), SHAPES[other.kind]
+    found = own.grown(0.0 if own.lends_margin and met.swept else shape.rounding)
+    return found.grown(other.rounding) if own.swept and met.lends_margin else found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,7 +164,7 @@ class PairSelection:
     def _lacks(self, shape: CollisionShape) -> str:
         """Return why no contact can have a shape of its kind; "" if one can."""
         if shape.index not in self._lacking:
-            self._lacking[shape.index] = _why_not_convex(shape)
+            self._lacking[shape.index] = shape.contact_shape().refusal(shape.triangles)
         return self._lacking[shape.index]
 
     def _shapes_of_name(self, name: Any) -> list[CollisionShape]:
@@ -204,28 +192,6 @@ class PairSelection:
         while body >= 0 and scene.hinges[scene.hinge_of[body]].dof_count == 0:
             body = scene.tree.parent[body]
         return body
-
-
-def _why_not_convex(shape: CollisionShape) -> str:
-    """Return why a contact cannot have a shape whose kind it may have; "" if it can."""
-    if shape.kind != "hull":
-        return ""
-    try:
-        hull, middle = _hull_of(shape)
-    except UnsupportedError as error:
-        return error.what
-    except ValueError as error:
-        return str(error).removeprefix(": ").partition(";")[0]
-    if shape.triangles is None or is_convex(hull, np.asarray(shape.sizes) - middle, shape.triangles):
-        return ""
-    return "a mesh that is not convex"
-
-
-def _hull_of(shape: CollisionShape) -> tuple[Hull, np.ndarray]:
-    """Return the hull of a shape's points about its middle, and that, in the axes of its pose."""
-    points = np.asarray(shape.sizes, dtype=np.float64)
-    outward = np.concatenate([spread_directions(SOME), np.eye(3), -np.eye(3)])
-    return convex_hull("", points, points[np.unique((points @ outward.T).argmax(axis=0))])
 
 
 def _is_pair(names: Any) -> bool:

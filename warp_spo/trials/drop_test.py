@@ -49,16 +49,17 @@ def drop(robot: Any, device: wp.Device) -> list[Snapshot]:
     """Return the frames of a robot of :mod:`warp_spo.env.robots` that is dropped, its servos holding its stand."""
     scene = robot.scene
     dyn = Dynamics(scene, 1, device)
-    points, field = len(scene.contact_points), scene.ground if isinstance(scene.ground, HeightField) else None
+    field = scene.ground if isinstance(scene.ground, HeightField) else None
     q, qd = robot.q[None].astype(np.float32), np.zeros((1, scene.dof_count), np.float32)
     q[0, 2] += FALL + (0.0 if field is None else max(0.0, float(np.max(field.heights))))
     qd[0, 0] = SPEED
-    force, slip = np.zeros((1, points, 3), np.float32), np.zeros((1, points), np.float32)
+    report = dyn.step_report("contact_f", "contact_slip", like=q)
+    force, slip = report.contact_f, report.contact_slip
     status, weight = np.zeros(1, np.int32), 9.81 * float(scene.values["body_mass"].sum())
     ctrl, found = robot.ctrl[None].astype(np.float32), []
     for number in range(FRAMES):
         for _ in range(round(PERIOD / DT) if number else 1):
-            q, qd = dyn.step(q, qd, None, DT, ctrl=ctrl, contact_f=force, contact_slip=slip, status=status)
+            q, qd = dyn.step(q, qd, dt=DT, ctrl=ctrl, status=status, report=report)
         acts = np.abs(force[0]).sum(axis=1) > 0.0
         load, slides = float(force[0, :, 2].sum() / weight), float((slip[0] * acts).max(initial=0.0))
         told = float(q[0, 2]), load, int(acts.sum()), slides, int(status[0])

@@ -31,7 +31,7 @@ from ...recursions.derivatives.contact_pass import (
 )
 from ...recursions.model.messages import SIZES
 from ...recursions.model.tracing import Trace
-from ...scene.contacts import HEIGHTS, HeightField
+from ...scene.ground import HEIGHTS, HeightField
 from . import midpoint_contact, midpoint_contact_gradients
 
 if TYPE_CHECKING:

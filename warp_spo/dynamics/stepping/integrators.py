@@ -43,9 +43,11 @@ def _limbs_couple(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
     return pair_pieces.by_limbs(scene)
 
 
-STEP = Routine("step", recursion.step, letters="PzaSX", divides=_divides, passes=True, wide=True)
+STEP = Routine(
+    "step", recursion.step, segments=SegmentForm(messages="PzaSX", divides=_divides, wide=True), passes=PassForm()
+)
 BODIES_BY_KINEMATICS = Routine(
-    "body_states", kinematics.body_states, alone=True, passes=True, wide=True, body_kinematics=True
+    "body_states", kinematics.body_states, segments=SegmentForm(wide=True, body_kinematics=True), passes=PassForm()
 )
 PAIRED_STEP = Routine(
     "paired_step",

@@ -35,9 +35,11 @@ if TYPE_CHECKING:
 MIDPOINT_PASSES = 4  # passes from which on a step uses the midpoint scheme
 ITERATIONS = 2
 UNSETTLED = 0.1  # share of the largest rate by which the final kick may change a rate without a status
-CONTACT_STEP = Routine("contact_step", contact_step.step, letters="PzafSE", passes=True, counted=True, wide=True)
-FIRST_KICK = Routine("middle_kick", first_kick, letters="fPza")
-FINAL_KICK = Routine("last_kick", final_kick, letters="fPza")
+CONTACT_STEP = Routine(
+    "contact_step", contact_step.step, segments=SegmentForm(messages="PzafSE", wide=True), passes=PassForm(counted=True)
+)
+FIRST_KICK = Routine("middle_kick", first_kick, segments=SegmentForm(messages="fPza"))
+FINAL_KICK = Routine("last_kick", final_kick, segments=SegmentForm(messages="fPza"))
 INTEGRATE_VJP = Routine("integrate_vjp", adjoints.integrate_vjp)
 
 

@@ -19,8 +19,9 @@ from ...recursions.contact.couples import Team as Couplings
 from ...recursions.contact.points import own_points
 from ...recursions.contact.secant_laws import SECANT
 from ...recursions.model import messages, shared_constants
+from ...recursions.model.exchange import SegmentExchange
 from ...recursions.model.messages import INWARD, OUTWARD
-from ...recursions.model.segments import PARTS, Segment, Segments
+from ...recursions.model.segments import Segment, Segments
 from ...recursions.model.tracing import Trace
 from ...recursions.step.phases import StepPhases, as_phases
 from ...recursions.step.step import FORCE, GAIN, GUESS, MISSED, RESISTANCE
@@ -31,30 +32,26 @@ from .. import staging
 from ..array_access import make_emitter
 from ..builder import Builder, Job, Program, flatten
 from ..device_facts import RESERVED
+from .schedule import PARTS, Schedule
 from .warp_specialized import HELD, PassLoop, SegmentCode, WarpSpecializedKernel
 
 MOST_REGISTERS = 255  # of a thread
+MOST_LAWS = (
+    12  # dofs of unlike segments; with more, laws are found in loops, because their statements are fetched slowly
+)
 BODIES = "bodies"  # option of a step by segments whose kernel writes the states of bodies, too
 
 
 class SegmentTrace(NamedTuple):
-    """The stores of the work on one segment.
+    """The work on one segment.
 
     Attributes:
-        stores: what its trace returns.
-        prologue: what it stores and sends before the passes. held: what it computes once before them.
-        laws, checks, final_messages, final_stores, couples, kept_between_sweeps: as of a
-            :class:`~warp_spo.recursions.model.tracing.Trace`.
+        phases: what its evaluation stores.
+        couples, carried: of the code that couples bodies, as of a :class:`~warp_spo.recursions.model.tracing.Trace`.
         constants: its constants, where they may be kept from folding.
     """
 
-    stores: list[Store]
-    prologue: list[Store]
-    held: list[Scalar]
-    laws: list[list[Store]]
-    checks: list[list[Store]]
-    final_messages: list[Store]
-    final_stores: list[list[Store]]
+    phases: StepPhases
     couples: list[tuple[int, list[Store]]]
     kept_between_sweeps: list[Value]
     constants: shared_constants.SharedConstants | None
@@ -62,8 +59,7 @@ class SegmentTrace(NamedTuple):
     @property
     def everything(self) -> list[Store]:
         """All stores of a segment."""
-        turns = (*self.laws, *self.checks, *self.final_stores, *(items for _, items in self.couples))
-        return [*self.prologue, *self.stores, *self.final_messages, *(item for turn in turns for item in turn)]
+        return [*self.phases.everything, *(item for _, items in self.couples for item in items)]
 
 
 class SegmentsCode(NamedTuple):
@@ -101,11 +97,14 @@ class _SegmentProgram:
     def __init__(self, builder: Builder, job: Job, segments: Segments, alone: bool, local: bool):
         self.builder, self.job, self.segments, self.alone, self.local = builder, job, segments, alone, local
         self.run, self.plan, self.dtype = builder.run, builder.plan, builder.dtype
-        self.letters = messages.needed(job.routine.letters, job.shapes)
+        self.schedule = Schedule(segments)
+        assert job.routine.segments is not None
+        self.form = job.routine.segments
+        self.letters = messages.needed(self.form.messages, job.shapes)
         self.offsets, self.sent = messages.offsets(self.letters, segments)
-        self.couples = self._couples() if job.routine.couples else None
+        self.couples = self._couples() if self.form.couples_bodies else None
         self.sent = self.couples.layout["end"] if self.couples is not None else self.sent
-        self.unfolds = not job.routine.couples  # constants in which segments differ may be kept from folding
+        self.unfolds = not self.form.couples_bodies  # constants in which segments differ may be kept from folding
 
     def build(self) -> Program | None:
         """Return the program; of two, with constants that fold and with some that do not, that with fewer texts."""
@@ -122,7 +121,8 @@ class _SegmentProgram:
         links = self.builder.links
         seats = pair_pieces.seats_of(links, segments := Segments(links))
         alpha = -1 if seats is None or seats.base is None else self.offsets["a", seats.base.index]
-        return pair_pieces.team(links, segments, alpha, self.sent)
+        warps = [assigned.warp for assigned in self.schedule.assignments]
+        return pair_pieces.team(links, segments, alpha, self.sent, warps)
 
     # -- the work of each segment ------------------------------------------------------------------------------------
     def _trace(self, index: int, unfolded: frozenset) -> SegmentTrace:
@@ -132,34 +132,32 @@ class _SegmentProgram:
         links = self.builder.own_links(
             options, self.unfolds
         )  # its own: segments of equal structure then give equal text
-        offset = lambda letter, segment: self.offsets[letter, segment.index]  # noqa: E731
-        trace = Trace(links, self.dtype, tuple(shapes), Segments(links).all[index], offset)
+        exchange = SegmentExchange(links, index, self.offsets, self.segments.distinct_dof_count > MOST_LAWS)
+        trace = Trace(links, self.dtype, tuple(shapes), exchange)
         trace.team = self.couples
-        if self.unfolds and trace.segment is not None:
+        if self.unfolds:
             points = [number for number, _ in own_points(trace)]
-            links.shared_constants = shared_constants.SharedConstants(links.graph, trace.segment, points, unfolded)
+            links.shared_constants = shared_constants.SharedConstants(links.graph, exchange.segment, points, unfolded)
 
         def flat(items: list[Store]) -> list[Store]:
             return [flatten(item, shapes) for item in items]
 
-        stores = flat(self.job.routine.trace(trace, **options))
-        found = SegmentTrace(
-            stores=stores,
-            prologue=trace.prologue,
-            held=trace.pass_invariants,
-            laws=trace.law_stores,
-            checks=trace.check_stores,
-            final_messages=flat(trace.final_messages),
-            final_stores=[flat(turn) for turn in trace.final_stores],
-            couples=trace.couples,
-            kept_between_sweeps=trace.kept_between_sweeps,
-            constants=links.shared_constants if self.unfolds else None,
+        phases = as_phases(self.job.routine.trace(trace, **options))
+        phases = phases._replace(
+            sweep=flat(phases.sweep),
+            epilogue=flat(phases.epilogue),
+            final_messages=flat(phases.final_messages),
+            final_stores=[flat(group) for group in phases.final_stores],
         )
-        return found._replace(held=_read(found.held, [*found.everything][len(found.prologue) :]))
+        found = SegmentTrace(
+            phases, trace.couples, trace.kept_between_sweeps, links.shared_constants if self.unfolds else None
+        )
+        used = _read(phases.pass_invariants, found.everything[len(phases.prologue) :])
+        return found._replace(phases=phases._replace(pass_invariants=used))
 
     def _gather(self, unfolded: list[frozenset]) -> SegmentsCode | None:
         """Return the work of all segments, None if there is no room; ``unfolded``: by segment, see :meth:`_trace`."""
-        job, segments = self.job, self.segments
+        job, segments, schedule = self.job, self.segments, self.schedule
         routine = job.routine
         traced = [self._trace(index, unfolded[index]) for index in range(len(segments.all))]
         everything = [item for one in traced for item in one.everything]
@@ -167,15 +165,15 @@ class _SegmentProgram:
         if not (bends or routine.is_counted):
             traced = [one._replace(phases=one.phases._replace(pass_invariants=[])) for one in traced]
         passes = self._passes(traced, bends)
-        sent = self.sent + (2 * segments.warps if bends else 0)
+        sent = self.sent + (2 * schedule.warps if bends else 0)
         whole = [item for item in everything if item.array == "out"]
-        warps = 1 if self.alone else segments.warps
+        warps = 1 if self.alone else schedule.warps
         layout = self.builder.layout(job, whole, everything, 0 if self.local else sent, warps)
         if not self._fits(layout):
             return None
         declared = "" if self.couples is None else coupling_teams.declare(self.couples, self.run.dtype, self.local)
-        kernel = WarpSpecializedKernel(segments, self.dtype, passes, declared)
-        outs = [[item for item in one.stores if item.array == "out"] for one in traced]
+        kernel = WarpSpecializedKernel(schedule, self.dtype, passes, declared)
+        outs = [[item for item in one.phases.sweep if item.array == "out"] for one in traced]
         placed, table = staging.arrange_stores(whole, layout.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
         looks_up = False
@@ -186,13 +184,13 @@ class _SegmentProgram:
 
     def _passes(self, traced: list[SegmentTrace], bends: bool) -> PassLoop | None:
         """Return how the work is repeated; ``bends``: guesses of a pass may turn out wrong."""
-        sizes = {index: len(one.held) for index, one in enumerate(traced)}
-        if self.job.routine.counted:
-            counts = [sum(item.array == SECANT for item in one.prologue) for one in traced]
+        sizes = {index: len(one.phases.pass_invariants) for index, one in enumerate(traced)}
+        if self.job.routine.is_counted:
+            counts = [sum(item.array == SECANT for item in one.phases.prologue) for one in traced]
             return PassLoop((GAIN,), None, sizes, dict(enumerate(counts)))
-        if not self.job.routine.passes:
+        if self.job.routine.passes is None:
             return None
-        kept = (GUESS, GAIN, FORCE, RESISTANCE) if any(one.laws for one in traced) else (GUESS, GAIN)
+        kept = (GUESS, GAIN, FORCE, RESISTANCE) if any(one.phases.laws for one in traced) else (GUESS, GAIN)
         return PassLoop(kept, self.sent if bends else None, sizes)
 
     def _fits(self, layout: KernelLayout) -> bool:
@@ -229,25 +227,38 @@ class _SegmentProgram:
         first, sweeps, ruling, checking = (emitter() for _ in range(4))
         later = emitter() if kernel.passes else sweeps
         pass_invariants = first.region(
-            [*one.prologue, *(Store(HELD, (at,), value) for at, value in enumerate(one.held))]
+            [*phases.prologue, *(Store(HELD, (at,), value) for at, value in enumerate(held))]
         )
-        sweeps.keep(HELD, one.held)
-        if routine.counted:
-            later.keep(HELD, one.held)  # other segments may have written over what these come from
-        inward = [item for item in one.stores if item.array == INWARD]
-        outward = [item for item in one.stores if item.array == OUTWARD]
+        sweeps.keep(HELD, held)
+        if routine.is_counted:
+            later.keep(HELD, held)  # other segments may have written over what these come from
+        inward = [item for item in phases.sweep if item.array == INWARD]
+        outward = [item for item in phases.sweep if item.array == OUTWARD]
         last = outward if set(self.letters) & set(messages.OUTWARD_LETTERS) else inward
         last += by_slot(outs)
-        last += [item for item in one.stores if item.array in (*more, GAIN, SECANT)]
+        last += [item for item in phases.sweep if item.array in (*more, GAIN, SECANT)]
         sweep = sweeps.region(inward, one.kept_between_sweeps)
         couples = [under(sweeps.branch(items), "SENT({}) > 0", INWARD, flag) for flag, items in one.couples]
         back = sweeps.region(outward)
-        ends = [item for item in one.final_messages if item.array == "out"]
-        final_messages = later.branch([item for item in one.final_messages if item.array != "out"] + by_slot(ends))
-        final_stores = [later.branch(by_slot(turn)) for turn in one.final_stores]
-        laws, checks = [ruling.branch(turn) for turn in one.laws], [checking.branch(turn) for turn in one.checks]
+        after = [*phases.epilogue, *phases.final_messages]
+        ends = [item for item in after if item.array == "out"]
+        final_messages = later.branch([item for item in after if item.array != "out"] + by_slot(ends))
+        final_stores = [later.branch(by_slot(group)) for group in phases.final_stores]
+        laws, checks = ([each.branch(group) for group in groups]
+                        for each, groups in ((ruling, phases.laws), (checking, phases.checks)))  # fmt: skip
         emitters = {first, sweeps, later, ruling, checking}
-        work = SegmentCode(segment, sweep, back, laws, checks, final_messages, final_stores, pass_invariants, couples)
+        work = SegmentCode(
+            segment,
+            self.schedule.assignments[segment.index],
+            sweep,
+            back,
+            laws,
+            checks,
+            final_messages,
+            final_stores,
+            pass_invariants,
+            couples,
+        )
         kernel.add(work, sum(each.operations for each in emitters))
         return any(each.counts["lookup"] for each in emitters)
 
@@ -264,7 +275,7 @@ class _SegmentProgram:
         if places := self.plan.spill_slots(
             routine, layout.shared_bytes(T), wp.types.type_size_in_bytes(T), layout.warps
         ):
-            layout, registers = layout._replace(spill_slots=places), routine.registers_when_spilling
+            layout, registers = layout._replace(spill_slots=places), routine.hints.registers_when_spilling
             cuda = spill_registers(cuda, C_TYPE[T], places)
         lists = {"place": table, "table": kernel.shared.table, "shifts": kernel.shared.shifts}
         tables = {name: values for name, values in lists.items() if values} | self.builder.height_tables(looks_up)
@@ -275,10 +286,10 @@ class _SegmentProgram:
 
     def _registers(self, layout: KernelLayout) -> int:
         """Return how many registers a thread may take, so that a multiprocessor holds as many blocks as help."""
-        warps = 1 if self.alone else self.segments.warps
+        warps = 1 if self.alone else self.schedule.warps
         if self.dtype == "float32" and not self.plan.latency_bound:
-            for blocks, enough in self.job.routine.occupancy:
-                fewer = self._shared_registers(blocks * self.segments.warps)
+            for blocks, enough in self.job.routine.hints.occupancy:
+                fewer = self._shared_registers(blocks * self.schedule.warps)
                 room = blocks * (layout.shared_bytes(self.run.dtype) + RESERVED) <= self.plan.device.shared_bytes
                 if fewer >= enough and room:
                     return fewer

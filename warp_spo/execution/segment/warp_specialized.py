@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 from ...kernels import pass_loops
 from ...recursions.contact.secant_laws import SECANT
-from ...recursions.model.segments import Segment, Segments
+from ...recursions.model.segments import Segment
 from ...trace.emission import C_TYPE, Listing, render
+from .schedule import Assignment, Schedule
 from .shared_code import SharedCode, any_of, choose
 
 HELD = "held"
@@ -25,6 +26,7 @@ class SegmentCode(NamedTuple):
 
     Attributes:
         segment: the segment.
+        assigned: the warp that works on it, and the stages of its sweeps.
         inward: the inward sweep.
         outward: the outward sweep.
         laws: what comes before the inward sweep of a pass, in turns of which many may be alike.
@@ -38,6 +40,7 @@ class SegmentCode(NamedTuple):
     """
 
     segment: Segment
+    assigned: Assignment
     inward: Listing
     outward: Listing
     laws: Sequence[Listing]
@@ -102,7 +105,7 @@ class WarpSpecializedKernel:
     """The work of all segments of a scene, and the kernel text made of it.
 
     Args:
-        segments: the segments.
+        schedule: warps and stages of the segments.
         dtype: the scalar type, "float32" or "float64".
         passes: the team repeats its work in passes; None if it does not.
         pairs: the definition of ``team_coupling``, which couples pairs of bodies; "" if there are none.
@@ -111,9 +114,10 @@ class WarpSpecializedKernel:
         shared: the texts that its warps share, and their tables.
     """
 
-    def __init__(self, segments: Segments, dtype: str, passes: PassLoop | None = None, pairs: str = ""):
+    def __init__(self, schedule: Schedule, dtype: str, passes: PassLoop | None = None, pairs: str = ""):
         self.pairs = pairs
-        self.segments, self.dtype, self.c, self.passes = segments, dtype, C_TYPE[dtype], passes
+        self.schedule, self.segments, self.passes = schedule, schedule.segments.all, passes
+        self.dtype, self.c = dtype, C_TYPE[dtype]
         self.shared = SharedCode(dtype)
         self._work: dict[int, SegmentCode] = {}
 
@@ -125,7 +129,7 @@ class WarpSpecializedKernel:
     @property
     def texts(self) -> list[tuple[str, ...]]:
         """The texts that are equal for segments that share their code, by segment."""
-        return [self._work[segment.index].text for segment in self.segments.all]
+        return [self._work[segment.index].text for segment in self.segments]
 
     @property
     def _definitions(self) -> list[str]:
@@ -136,10 +140,10 @@ class WarpSpecializedKernel:
         """The last stage that has statements."""
         stages = [0]
         for work in self._work.values():
-            stages += [work.segment.inward] if work.inward.text else []
-            stages += [work.segment.outward] if work.outward.text else []
+            stages += [work.assigned.inward] if work.inward.text else []
+            stages += [work.assigned.outward] if work.outward.text else []
             if work.final_stores and not self.passes:
-                stages.append(self.segments.stages - 1)  # inner segments read the final messages in the last stage
+                stages.append(self.schedule.stages - 1)  # inner segments read the final messages in the last stage
         return max(stages)
 
     def cpu(self) -> str:
@@ -147,16 +151,16 @@ class WarpSpecializedKernel:
         text: list[str] = []
         later: list[str] = []
         for stage in range(self._last + 1):
-            for segment in reversed(self.segments.all):
-                if segment.inward == stage:
+            for segment in reversed(self.segments):
+                if self._work[segment.index].assigned.inward == stage:
                     text += [self._branch(segment, each) for each in self._work[segment.index].laws]
                     text.append(render(self._work[segment.index].inward, self.dtype, f"p{segment.index}_"))
                     responses = [self._branch(segment, each) for each in self._work[segment.index].couples]
                     text += ["if (coupled) {", *responses, "}"] if responses else []
             text += [couple_pairs("0", 1)] if self.pairs and stage == 0 else []
             text += [release_pairs("0", 1)] if self.pairs and stage == self._last else []
-            for segment in self.segments.all:
-                if segment.outward == stage:
+            for segment in self.segments:
+                if self._work[segment.index].assigned.outward == stage:
                     text.append(render(self._work[segment.index].outward, self.dtype, f"p{segment.index}_"))
                     text += [self._branch(segment, each) for each in self._work[segment.index].checks if each.text]
                     (later if self.passes else text).append(
@@ -165,7 +169,7 @@ class WarpSpecializedKernel:
         for work in self._work.values():
             later += [self._branch(work.segment, listing) for listing in work.final_stores]
         if self.passes:
-            kept = {f"p{segment.index}_": [segment] for segment in self.segments.all}
+            kept = {f"p{segment.index}_": [segment] for segment in self.segments}
             order = reversed(self._work.values()) if self.passes.counted else self._work.values()  # children first
             pass_invariants = [
                 self._branch(work.segment, work.pass_invariants) for work in order if work.pass_invariants.text
@@ -195,14 +199,12 @@ class WarpSpecializedKernel:
         for equal in kinds.values():
             text.append(f"{'else ' if text else ''}if ({any_of(_warps(equal))}) {{")
             inward, outward = self._shared_sweeps(equal)
-            warps = [work.segment.warp for work in equal]
+            warps = [work.assigned.warp for work in equal]
             between = self._inner(warps)
             if self.pairs:
-                inward = "\n".join([push_pairs("LOAD", "warp", self.segments.warps), inward])
-                between = "\n".join([
-                    BARRIER, couple_pairs("warp", self.segments.warps), between,
-                    release_pairs("warp", self.segments.warps)
-                ])  # fmt: skip
+                inward = "\n".join([push_pairs("LOAD", "warp", self.schedule.warps), inward])
+                couple, release = (call("warp", self.schedule.warps) for call in (couple_pairs, release_pairs))
+                between = "\n".join([BARRIER, couple, between, release])
             text += [inward, between, outward]
             if not self.passes and any(work.final_stores for works in kinds.values() for work in works):
                 text += [
@@ -219,10 +221,10 @@ class WarpSpecializedKernel:
         leaves = [work for work in self._work.values() if not work.segment.children]
         inner = [work for work in self._work.values() if work.segment.children]
         ranks: list[dict[int, SegmentCode]] = [
-            {leaf.segment.warp: leaf for leaf in leaves}
+            {leaf.assigned.warp: leaf for leaf in leaves}
         ]  # by warp, one of its segments each
         for work in inner:
-            warp = work.segment.warp
+            warp = work.assigned.warp
             free = next((rank for rank in ranks if warp not in rank), None)
             if free is None:
                 ranks.append(free := {})
@@ -233,8 +235,8 @@ class WarpSpecializedKernel:
         ranks_by_name = dict(zip(names, ranks, strict=True))
         text += self._before_passes(leaves, ranks_by_name)
         if self.pairs:
-            text += [BARRIER, begin_pairs("warp", self.segments.warps)]
-            a_pass = "\n".join([a_pass, BARRIER, judge_pairs("warp", self.segments.warps)])
+            text += [BARRIER, begin_pairs("warp", self.schedule.warps)]
+            a_pass = "\n".join([a_pass, BARRIER, judge_pairs("warp", self.schedule.warps)])
         if self._laws_in_loops:
             a_pass = "\n".join(
                 [
@@ -248,11 +250,11 @@ class WarpSpecializedKernel:
         elif self.passes.flags is None:
             text.append(pass_loops.run_one_pass(a_pass, BARRIER, self.c))
         else:
-            text.append(pass_loops.repeat_team_passes(a_pass, self.passes.flags, self.segments.warps, self.c))
+            text.append(pass_loops.repeat_team_passes(a_pass, self.passes.flags, self.schedule.warps, self.c))
         for last in (False, True):
             text_of_ranks = []
             for at, (name, rank) in enumerate(zip(names, ranks, strict=True)):
-                works = [rank.get(leaf.segment.warp) for leaf in leaves]
+                works = [rank.get(leaf.assigned.warp) for leaf in leaves]
                 turns = [[] if work is None else work.final_stores if last else [work.final_messages] for work in works]
                 text_of_ranks.append(self._take_turns(leaves, turns, f"c{at}_", name))
             if last and any(text_of_ranks):
@@ -270,7 +272,7 @@ class WarpSpecializedKernel:
         :meth:`_before_passes`."""
         text = []
         for at, (prefix, rank) in enumerate(ranks.items()):
-            works = [rank.get(leaf.segment.warp) for leaf in leaves]
+            works = [rank.get(leaf.assigned.warp) for leaf in leaves]
             turns = [[] if work is None else [*getattr(work, name)] for work in works]
             text.append(self._take_turns(leaves, turns, f"{name}{at}_", prefix, loops=True))
         return "\n".join(text)
@@ -284,16 +286,16 @@ class WarpSpecializedKernel:
         text: list[str] = []
         if not self.passes.counted:
             for at, (name, rank) in enumerate(ranks.items()):
-                works = [rank.get(leaf.segment.warp) for leaf in leaves]
+                works = [rank.get(leaf.assigned.warp) for leaf in leaves]
                 text.append(
                     self._take_turns(leaves, [[] if x is None else [x.pass_invariants] for x in works], f"h{at}_", name)
                 )
             return text
-        for stage in range(1 + max(work.segment.inward for work in self._work.values())):
+        for stage in range(1 + max(work.assigned.inward for work in self._work.values())):
             text += [BARRIER] if stage else []
             for at, (name, rank) in reversed(list(enumerate(ranks.items()))):  # children before their parents
-                works = [rank.get(leaf.segment.warp) for leaf in leaves]
-                turns = [[x.pass_invariants] if x is not None and x.segment.inward == stage else [] for x in works]
+                works = [rank.get(leaf.assigned.warp) for leaf in leaves]
+                turns = [[x.pass_invariants] if x is not None and x.assigned.inward == stage else [] for x in works]
                 text.append(self._take_turns(leaves, turns, f"h{stage}_{at}_", name))
         return text
 
@@ -302,19 +304,19 @@ class WarpSpecializedKernel:
         ``warps``."""
         owners: dict[tuple, list[list[SegmentCode]]] = {}
         for warp in warps:
-            mine = [work for work in self._work.values() if work.segment.children and work.segment.warp == warp]
+            mine = [work for work in self._work.values() if work.segment.children and work.assigned.warp == warp]
             if mine:
-                owners.setdefault(tuple((w.text, w.segment.inward, w.segment.outward) for w in mine), []).append(mine)
+                owners.setdefault(tuple((w.text, w.assigned.inward, w.assigned.outward) for w in mine), []).append(mine)
         text: list[str] = []
         for chains in owners.values():
-            text.append(f"{'else ' if text else ''}if ({any_of([chain[0].segment.warp for chain in chains])}) {{")
+            text.append(f"{'else ' if text else ''}if ({any_of([chain[0].assigned.warp for chain in chains])}) {{")
             shared = [self._shared_sweeps(equal, f"i{at}_") for at, equal in enumerate(zip(*chains, strict=True))]
             for stage in range(1, self._last + 1):
                 text.append(BARRIER)
                 order = list(zip(chains[0], shared, strict=True))
-                text += [inward for work, (inward, _) in reversed(order) if work.segment.inward == stage]
+                text += [inward for work, (inward, _) in reversed(order) if work.assigned.inward == stage]
                 for at, (equal, (_, outward)) in enumerate(zip(zip(*chains, strict=True), shared, strict=True)):
-                    if equal[0].segment.outward == stage:
+                    if equal[0].assigned.outward == stage:
                         text.append(outward)
                         if not self.passes:
                             text.append(
@@ -403,4 +405,4 @@ def _any_world(call: str, warps: int) -> str:
 
 def _warps(works: Sequence[SegmentCode]) -> list[int]:
     """Return the warp of each segment."""
-    return [work.segment.warp for work in works]
+    return [work.assigned.warp for work in works]

@@ -10,7 +10,7 @@ from xml.etree.ElementTree import ParseError
 import newton
 
 from ...scene.collision_shapes import POINTS, ShapeSelection
-from ...scene.contacts import HeightField, Plane
+from ...scene.ground import HeightField, Plane
 from ...scene.scene import Scene
 from .urdf import read_urdf
 from .usd import read_usd

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...scene.collision_shapes import CollisionShape
+from ...scene.contact_shapes import SHAPES, kinds_in
 from .urdf_masses import mesh_file, unit_of
 from .xml_source import XmlElement
 

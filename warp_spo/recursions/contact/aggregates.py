@@ -262,7 +262,9 @@ def force_to_parent(pose: Pose, z: Vector) -> Vector:
     return Vector((*n, *f))
 
 
-def reduce(trace: Trace, plan: TiePlan, nodes: dict[int, Node], tau: Callable[[int], Value]) -> tuple[Factors, dict]:
+def reduce(
+    trace: Trace, plan: TiePlan, nodes: dict[int, Node], tau: Callable[[int], Value], phases: PhaseBuilder
+) -> tuple[Factors, dict]:
     """Sweep inward; ``nodes`` by id of the first link of each aggregate. Return factors and D^-1 eps, by link."""
     done: Factors = {}
     rates: dict[int, list[Value]] = {}
@@ -271,7 +273,7 @@ def reduce(trace: Trace, plan: TiePlan, nodes: dict[int, Node], tau: Callable[[i
     own: dict[int, Vector] = {}
     for link in trace.links.links:
         trace.place(link)
-        trace.pass_invariants += trace.places[id(link)].pose.turn or ()
+        phases.add_invariants(trace.places[id(link)].pose.turn or ())
     for link in reversed(plan.order):
         at, place = id(link), trace.places[id(link)]
         eliminate(trace, link, done, inner)

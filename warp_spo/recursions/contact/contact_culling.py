@@ -102,7 +102,7 @@ def group_points(
         if point.link is not None:
             on.setdefault(id(point.link), []).append(at)
     found: dict[int, CullGroup] = {}
-    op = "branch" if trace.segment is None else "fork"
+    op = "branch" if trace.exchange.alone else "fork"
     for key, places in on.items():
         some = [points[at] for at in places]
         if len(some) >= CULL_AT_LEAST and all(point.near is None for point in some):

@@ -50,13 +50,17 @@ def suits(links: Links) -> bool:
 class CoupledStep(ContactStepTrace):
     """One time step with contacts of bodies with each other, too, as a trace; arguments as those of ContactStep."""
 
-    def stores(self, qdd: bool, status: bool) -> list[Store]:
-        """Return the stores of a pass, then those after the last one; ``trace.prologue`` are those before the first."""
+    def stores(self, qdd: bool, status: bool) -> StepPhases:
+        """Return the stores before the first pass, those of a pass, and those after the last one."""
         self.first: list[Store] = []
         self.twists: list[Store] = []
         found = super().stores(qdd, status)
-        self.trace.prologue = [*self.trace.prologue, *self.first]
-        return found + self.twists + [item for name in self.reports for item in self._report_stores(name)]
+        reported = [item for name in self.reports for item in self._report_stores(name)]
+        return found._replace(
+            prologue=found.prologue + self.first,
+            sweep=found.sweep + self.twists,
+            epilogue=found.epilogue + reported,
+        )
 
     def inward(self, tau: Callable[[int], Value]) -> tuple[Factors, dict, list[Store]]:
         """Return factors and D^-1 eps of a pass by link, for forces of the dofs; no stores that send."""
@@ -104,10 +108,10 @@ class CoupledStep(ContactStepTrace):
             mine = [ties[number] for number in aggregate.couples]
             first, seats = aggregate.links[0], self.seats[aggregate.couples[0]]
             self.nodes[id(first)] = Node(trace, self.plan, aggregate, mask, seats, mine)
-            trace.pass_invariants += [x for tie in mine for column in tie.J.values() for x in column]
+            self.phases.add_invariants(x for tie in mine for column in tie.J.values() for x in column)
             for seat in seats.values():
-                trace.pass_invariants += [*(x for row in seat.turn for x in row), *seat.at]
-        trace.pass_invariants += [x for R, _ in self.frames.values() for row in R for x in row]
+                self.phases.add_invariants([*(x for row in seat.turn for x in row), *seat.at])
+        self.phases.add_invariants(x for R, _ in self.frames.values() for row in R for x in row)
 
     def _frames(self, links: list[Link | None]) -> dict[int | None, tuple[Matrix, Vector]]:
         """Return axes and origins of links in the inertial frame."""

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ...scene.pairs import SWEPT_SEGMENT
 from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Value, sqrt
@@ -119,8 +118,7 @@ def solids_of(links: Links) -> tuple[Solids, tuple[int, ...], tuple[tuple[int, t
     of = [[None if one.hull is None else Polyhedron(one.hull.planes, one.hull.edges) for one in both] for both in kinds]
     hull = tuple((hulls.setdefault(a, len(hulls) - 1), hulls.setdefault(b, len(hulls) - 1)) for a, b in of)
     solids = Solids(
-        len(bodies), len(shapes), tuple(sides),
-        tuple((a.kind != SWEPT_SEGMENT, b.kind != SWEPT_SEGMENT) for a, b in kinds),
+        len(bodies), len(shapes), tuple(sides), tuple((a.has_faces, b.has_faces) for a, b in kinds),
         tuple((*a.size.tolist(), *b.size.tolist()) for a, b in kinds), tuple((a.radius, b.radius) for a, b in kinds),
         hull, tuple(one for one in hulls if one is not None),
     )  # fmt: skip
@@ -185,8 +183,12 @@ class PairedStep(ground.ContactStepTrace):
         self.first: list[Store] = []
         self.response: list[Store] = []
         found = super().stores(qdd, status)
-        self.trace.prologue = [*self.trace.prologue, *self.first]
-        return self.response + found + [item for name in self.reports for item in self._report_stores(name)]
+        reported = [item for name in self.reports for item in self._report_stores(name)]
+        return found._replace(
+            prologue=found.prologue + self.first,
+            sweep=self.response + found.sweep,
+            epilogue=found.epilogue + reported,
+        )
 
     def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, tuple[Vector, Vector]]) -> dict[int, Value]:
         """Return qd' - qd by dof with the forces between bodies; ``alpha`` becomes that of the links."""
@@ -231,8 +233,8 @@ class PairedStep(ground.ContactStepTrace):
             (w, v), R = before[id(link)], self.trace.axes[id(link)]
             twist = (*velocity(R, w, v, arm), *(R @ w))
             self.first += [Store(START, (6 * number + c,), value) for c, value in enumerate(twist)]
-        self.trace.pass_invariants += [value for key, pair in before.items() if key for part in pair for value in part]
-        self.trace.pass_invariants += [value for axes in self.trace.axes.values() for row in axes for value in row]
+        self.phases.add_invariants(value for key, pair in before.items() if key for part in pair for value in part)
+        self.phases.add_invariants(value for axes in self.trace.axes.values() for row in axes for value in row)
 
     def _responses(self, done: dict, frames: tuple) -> list[Store]:
         """Return the stores of the blocks J A0^-1 J*."""

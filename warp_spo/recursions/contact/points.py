@@ -34,7 +34,7 @@ from ..kinematics import arm_on_link, carried_velocity, frame_on_link, zero
 from ..model import effective_mass
 from ..model.links import Link, Links
 from ..model.scene_cache import cached_by_scene
-from ..model.segments import Segment, Segments
+from ..model.segments import Segment
 from ..model.tracing import Trace
 from ..motion import VelocityTerms, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
@@ -245,7 +245,8 @@ def point_links(links: Links) -> list[Link | None]:
 
 def own_points(trace: Trace) -> list[tuple[int, ContactPoint]]:
     """Return the contact points that a trace works on, with their numbers."""
-    return points_of(trace.links, trace.segment)
+    exchange = trace.exchange
+    return _all_points(trace.links) if exchange.alone else points_of(trace.links, exchange.own_segments[0])
 
 
 def keeps_arms(trace: Trace) -> bool:
@@ -253,18 +254,19 @@ def keeps_arms(trace: Trace) -> bool:
 
     Where segments share the work they do, unless a segment has so many spheres that registers run out.
     """
-    segments = [] if trace.segment is None else Segments(trace.links).all
+    segments = trace.exchange.segments if trace.exchange.shares_code else []
     spheres = (sum(point.radius > 0.0 for _, point in points_of(trace.links, segment)) for segment in segments)
     return max(spheres, default=0) <= ARMS
 
 
-def points_of(links: Links, segment: Segment | None) -> list[tuple[int, ContactPoint]]:
-    """Return the contact points that a segment works on, or the whole tree, with their numbers."""
-    points = list(enumerate(links.scene.contact_points))
-    if segment is None:
-        return points
+def _all_points(links: Links) -> list[tuple[int, ContactPoint]]:
+    return list(enumerate(links.scene.contact_points))
+
+
+def points_of(links: Links, segment: Segment) -> list[tuple[int, ContactPoint]]:
+    """Return the contact points that a segment works on, with their numbers."""
     on: dict[int | None, list[tuple[int, ContactPoint]]] = {}
-    for number, point in points:
+    for number, point in _all_points(links):
         link = links.placements[point.body].link
         on.setdefault(None if link is None else id(link), []).append((number, point))
     found = on.get(None, []) if segment.index == 0 else []

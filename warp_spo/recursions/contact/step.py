@@ -22,7 +22,6 @@ from ..articulated_sweeps import Factors, expand, reduce
 from ..coordinates import integrate_link
 from ..kinematics import zero
 from ..model.links import Link
-from ..model.segments import Segment, Segments
 from ..newton_euler import inverse_dynamics
 from ..step.joint_laws import Law, add_laws
 from ..step.phases import StepPhases
@@ -70,15 +69,12 @@ class ContactStepTrace(Step):
         self.excess: list[Value] = []  # of cone, adhesion, effort; largest push of a point that the last pass left open
         self.finished: dict[str, list[Store]] = {name: [] for name in reports}
 
-    def stores(self, qdd: bool, status: bool) -> list[Store]:
-        """Return the stores of a pass, then those after the last one; ``trace.prologue`` are those before the first.
-
-        For a segment, those after the last pass are the trace's ``final_messages``.
-        """
-        trace, pass_variables = self.trace, self.pass_variables
+    def stores(self, qdd: bool, status: bool) -> StepPhases:
+        """Return the stores before the first pass, those of a pass, and those after the last one."""
+        trace, pass_variables, phases = self.trace, self.pass_variables, self.phases
         bias, sent_ahead = self._bias()
         points, states, candidates = [], [], []
-        alone = trace.segment is None  # segments side by side are for GPUs, where branches cost more than they spare
+        alone = trace.exchange.alone  # segments side by side are for GPUs, where branches cost more than they spare
         for raw in place_points(trace, self.joint_laws, self.qd, "contact_f" in self.reports, branches=alone):
             point, first = raw.restrict_to_near(*self._first(raw))
             points.append(point)
@@ -86,11 +82,9 @@ class ContactStepTrace(Step):
             candidates.append(first[1])
         self._group_points(points, states, candidates)
         arms = keeps_arms(trace)
-        trace.pass_invariants = [*bias.values()]
-        trace.pass_invariants += [value for point in points for value in point.kept_values(arms)]
-        trace.pass_invariants += [
-            value for group in self.cull_groups.values() for value in (group.highest, group.reach)
-        ]
+        phases.add_invariants(bias.values())
+        phases.add_invariants(value for point in points for value in point.kept_values(arms))
+        phases.add_invariants(value for group in self.cull_groups.values() for value in (group.highest, group.reach))
         self._press(points, states)
         trace.with_step_armature = self._with_resistance
         tau = trace.vector("tau")
@@ -101,7 +95,7 @@ class ContactStepTrace(Step):
         gains = {item.index[0]: self.h * item.value for item in moved if item.array == "out"}
         gains = self.couple(done, gains, alpha)
         passed = [item for item in moved if item.array != "out"]
-        passed += [Store(GAIN, (self._pass_index.get(dof, dof),), gain) for dof, gain in gains.items()]
+        passed += [Store(GAIN, (trace.exchange.place_of(dof),), gain) for dof, gain in gains.items()]
         efforts = []
         for link in self.links:
             trace.label(link, "u")
@@ -114,18 +108,15 @@ class ContactStepTrace(Step):
         forces = self._forces(points, states, alpha, excess)
         for number, surfaces in forces.items():
             self._report(number, surfaces)
-        trace.pass_invariants += [
-            item.value for item in self.finished.get("contact_gap", ())
-        ]  # of the state before the step
+        gaps = self.finished.get("contact_gap", ())
+        phases.add_invariants(item.value for item in gaps)  # of the state before the step
         if status or "contact_excess" in self.reports:
             trace.graph.step = "excess|e"
             self.excess = [self._last(largest(values)) for values in (*excess[:2], efforts, excess[2])]
-        trace.prologue = sent_ahead + pass_variables.initial_stores
-        after = self._after(qdd, status)
-        if trace.segment is None:
-            return passed + pass_variables.stores + after
-        trace.final_messages = after
-        return sent + passed + pass_variables.stores
+        phases.add_prologue(sent_ahead + pass_variables.initial_stores)
+        phases.add_epilogue(self._after(qdd, status))
+        phases.add_sweep(sent + passed + pass_variables.stores)
+        return phases.phases
 
     def _forces(
         self, points: list[TracedContactPoint], states: list[PointState], alpha: dict, excess: tuple[list[Value], ...]
@@ -331,8 +322,9 @@ class ContactStepTrace(Step):
         results = [item.value for item in stores]
         for name in self.reports:
             stores += self.finished[name]
-        if trace.segment is not None:
-            return stores + self._sent_to_the_first(trace.segment, results, status)
+        if not trace.exchange.alone:
+            self._send_to_the_first(results, status)
+            return stores
         if self.excess and any(more := self.last_excess()):
             self.excess = [largest([own, *others]) for own, others in zip(self.excess, more, strict=True)]
         stores += self._excess_stores()
@@ -341,21 +333,20 @@ class ContactStepTrace(Step):
             stores.append(Store("status", (), self._final_status(self._status_word(results, False))))
         return stores
 
-    def _sent_to_the_first(self, own: Segment, results: list[Value], status: bool) -> list[Store]:
-        """Return the stores that send a segment's excess and status to the first segment, which stores the world's."""
-        trace, sent = self.trace, []
+    def _send_to_the_first(self, results: list[Value], status: bool) -> None:
+        """Send a segment's excess and status to the first segment, which stores the world's."""
+        exchange, phases = self.trace.exchange, self.phases
         if self.excess:
-            sent += trace.send("E", own, self.excess)
-            if own.index == 0:
-                segments = Segments(trace.links).all
-                sent_by = zip(*(trace.receive("E", segment) for segment in segments), strict=True)
+            phases.add_final_messages(exchange.send("E", exchange.own_segments[0], self.excess))
+            if exchange.is_first:
+                sent_by = zip(*(exchange.receive("E", piece) for piece in exchange.segments), strict=True)
                 kinds = ((*values, *more) for values, more in zip(sent_by, self.last_excess(), strict=True))
                 self.excess = [largest(list(values)) for values in kinds]
-        sent += self._send_status(own, results) if status else []
-        first = [*self._excess_stores(), *self.reported()] if own.index == 0 else []
-        if first:
-            trace.final_stores = [[*first, *(item for turn in trace.final_stores for item in turn)]]
-        return sent
+        sent, word = self._send_status(results) if status else ([], [])
+        phases.add_final_messages(sent)
+        last = [*self._excess_stores(), *self.reported(), *word] if exchange.is_first else []
+        if last:
+            phases.add_final_stores(last)
 
     def _excess_stores(self) -> list[Store]:
         asked = self.excess[:3] if "contact_excess" in self.reports else []

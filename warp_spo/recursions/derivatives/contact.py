@@ -50,7 +50,7 @@ from ..contact.velocity_kicks import KICK, PATH, START
 from ..coordinates import integrate_link
 from ..kinematics import carried_velocity
 from ..model.links import Link
-from ..model.segments import Segment, Segments
+from ..model.segments import Segment
 from ..motion import hinge_motion, whirl
 from .adjoints import entries, result_name
 from .contact_pass import NUMBER, OnePass
@@ -121,17 +121,16 @@ class PassAdjoint(OnePass):
     @property
     def _carrier(self) -> Segment | None:
         """The segment that this one moves on, if that is one of those weighed."""
-        segment = self.trace.segment
-        above = None if segment is None else segment.parent
+        above = self.trace.exchange.parent
         return above if above is not None and above.index in self.weighed else None
 
     @property
     def _inertia_message(self) -> list[Value]:
         """Message of the segment's articulated inertia, with the dampers of its points on the link that it moves on."""
-        segment = self.trace.segment
-        if self._carrier is None or segment is None:
+        if self._carrier is None:
             return []
-        P, link = self.inner[id(segment.links[0])], segment.links[0]
+        link = self.trace.own_links[0]
+        P = self.inner[id(link)]
         return (
             P + self.trace.contact_inertia[id(link.parent)] if id(link.parent) in self.trace.contact_inertia else P
         ).packed
@@ -234,17 +233,17 @@ class PassSolve(PassAdjoint):
 
     def _tell(self, results: list[Value], seeds: list[Value]) -> list[Store]:
         """Return the stores of the gradient by what segments carry, and those that tell it to the segments carried."""
-        trace, found = self.trace, []
-        for at, index in enumerate(self.weighed):
-            segment = trace.segment or Segments(trace.links).all[index]
-            if segment.index != index:
+        exchange, found = self.trace.exchange, []
+        for segment in exchange.own_segments:
+            if segment.index not in self.weighed:
                 continue
-            carried = trace.from_children(segment.links[-1], "P", self.inner, Articulated.unpacked)[0].packed
+            at = self.weighed.index(segment.index)
+            carried = exchange.from_children(segment.links[-1], "P", self.inner, Articulated.unpacked)[0].packed
             gradients = _by_each(carried, reverse(results, _distinct(carried), seeds, True))
             found += [
                 Store(f"{INERTIA}_out", (len(gradients) * at + i,), gradient) for i, gradient in enumerate(gradients)
             ]
-            found += trace.send("Q", segment, gradients)
+            found += exchange.send("Q", segment, gradients)
         return found
 
 
@@ -258,9 +257,9 @@ class PassGradient(PassAdjoint):
     """
 
     def __init__(self, trace: Trace, laws: tuple[int, ...]):
-        segment = trace.segment
-        self._under = None if segment is None or segment.parent is None else segment.parent.links[-1]
-        self._end = segment.links[-1] if segment is not None and segment.children else None
+        parent = trace.exchange.parent
+        self._under = None if parent is None else parent.links[-1]
+        self._end = trace.own_links[-1] if trace.exchange.children else None
         self._reached = with_ancestors(point_links(trace.links))
         self.given: list[Value] = []
         self.passed_on: list[Value] = []
@@ -320,9 +319,9 @@ class PassGradient(PassAdjoint):
                 results + packed,
                 seeds + [trace.graph.input(INERTIA, first + i) for i in range(len(packed))],
             )
-        for segment in trace.segment.children if trace.segment is not None else ():
+        for segment in trace.exchange.children:
             results += self.passed_on
-            seeds += trace.receive("G", segment)[: len(self.passed_on)]
+            seeds += trace.exchange.receive("G", segment)[: len(self.passed_on)]
         held = [*self.qdd.values(), *self.solved.values(), *self.before.values(), *pass_variables.variables.values()]
         stops = _distinct([*self.given, *held])
         leaves = [x for x in ordered(results, stops) if x.op == "input"]
@@ -345,21 +344,22 @@ class PassGradient(PassAdjoint):
             if name == HEIGHTS:
                 cells = zip(self.surfaces, (point.cell for point in self.points), strict=True)
                 found += [Store(f"{HEIGHTS_AT}_bar", (at,), cell.first) for at, cell in cells if cell is not None]
-            if name == ORIGIN and trace.segment is not None:
-                sent += self._add_origins(trace.segment, gradients)
-                if trace.segment.parent is not None:
+            if name == ORIGIN:
+                sent += self._add_origins(gradients)
+                if trace.exchange.parent is not None:
                     continue
             for index, value in self._entries(name, gradients):
                 found.append(Store(result_name(name, wrt), index, self._of_later(f"{name}_later", *index) + value))
         return [*sent, *power.stores, *found]
 
-    def _add_origins(self, own: Segment, gradients: Gradients) -> list[Store]:
+    def _add_origins(self, gradients: Gradients) -> list[Store]:
         """Add to the gradient by the ground's origin those of the segments further out; return what sends it inward."""
-        for segment in own.children:
-            for i, more in enumerate(self.trace.receive("O", segment)):
+        exchange = self.trace.exchange
+        for segment in exchange.children:
+            for i, more in enumerate(exchange.receive("O", segment)):
                 gradients[ORIGIN, i] = gradients.get((ORIGIN, i), 0.0) + more
         sums = [gradients.get((ORIGIN, i), 0.0) for i in range(3)]
-        return self.trace.send_to_parent("O", own.links[0], sums)
+        return exchange.send_to_parent("O", self.trace.own_links[0], sums)
 
     def _entries(self, name: str, gradients: Gradients) -> Iterable[tuple[tuple[int, ...], Value]]:
         """Return (index, gradient) of every entry of an argument or value that this trace works on.
@@ -368,9 +368,9 @@ class PassGradient(PassAdjoint):
         """
         if name == HEIGHTS:
             places: Iterable[tuple[int, ...]] = itertools.product(self.surfaces, range(CORNERS))
-        elif self.trace.segment is not None and name in CONTACT_VALUES:
+        elif not self.trace.exchange.alone and name in CONTACT_VALUES:
             places = [(number,) for number, _ in own_points(self.trace)]
-        elif self.trace.segment is not None and name == "ctrl":
+        elif not self.trace.exchange.alone and name == "ctrl":
             places = [(number,) for number in self._controls(list(self.before))]
         else:
             return entries(self.trace, name, gradients)

@@ -19,7 +19,6 @@ from ..contact.points import TracedContactPoint, own_points, surface_numbers
 from ..contact.secant_laws import PassVariables, single_dofs
 from ..contact.step import ContactStepTrace, PointState
 from ..model.links import Link, Links
-from ..model.segments import Segments
 from ..step.joint_laws import LIMIT, Law
 from ..step.step import GAIN
 
@@ -90,7 +89,7 @@ class OnePass(ContactStepTrace):
         """Numbers of the segments that carry others whose inertia counts in what laws leave for the next pass."""
         if not self.has_kicks:
             return ()
-        segments = Segments(self.trace.links).all
+        segments = self.trace.exchange.segments
         own = {
             segment.index for segment in segments if any(self._weighs(link) for link in segment.links if link.is_leader)
         }
@@ -133,17 +132,11 @@ class OnePass(ContactStepTrace):
     def forward(self) -> list[Store]:
         """Return the stores of what the pass leaves, and messages to other segments."""
         trace = self.trace
-        dofs = {self._pass_index.get(dof, dof): dof for dof in self.before}
-        stores = self.stores(qdd=False, status=False)
-        sent = [item for item in trace.prologue if item.array != ROW]
-        trace.prologue, trace.pass_invariants, trace.final_messages, trace.final_stores = (
-            [],
-            [],
-            [],
-            [],
-        )  # there is no loop
-        after = (GAIN, "out", "q_out", *(item.array for item in self.pass_variables.stores))
-        sent += [item for item in stores if item.array not in after]
+        dofs = {trace.exchange.place_of(dof): dof for dof in self.before}
+        found = self.stores(qdd=False, status=False)
+        sent = [item for item in found.prologue if item.array != ROW]
+        after = (GAIN, *(item.array for item in self.pass_variables.stores))
+        sent += [item for item in found.sweep if item.array not in after]
         gains = [
             Store("out", (dofs[item.index[0]],), item.value * reciprocal(self.h))
             for item in found.sweep

@@ -1,9 +1,6 @@
-"""Segments: the serial chains of links of a scene, and the warps and stages in which kernels work on them.
+"""Segments: the partition of a scene's links into serial chains.
 
-A segment is one of the paper's strictly canonical tree: it ends where the tree branches. One warp works on each leaf
-segment. A segment further in is worked on by the warp of the child that is done last, or by the one with least work
-where several are. Work proceeds in stages with a barrier between them: a segment goes inward in the first stage in
-which all that it carries is done, and outward after its parent.
+A segment of the paper's strictly canonical tree ends where the tree branches.
 """
 
 from __future__ import annotations
@@ -21,16 +18,12 @@ class Segment:
         index: its place in :attr:`Segments.all`.
         links: from the innermost out.
         parent, children: the segments that it moves on and that move on it.
-        warp: index of the warp that works on it. inward, outward: stage of its inward and of its outward sweep.
     """
 
     index: int
     links: list[Link]
     parent: Segment | None
     children: list[Segment] = dataclasses.field(default_factory=list)
-    warp: int = 0
-    inward: int = 0
-    outward: int = 0
 
     @property
     def dofs(self) -> list[int]:
@@ -88,11 +81,7 @@ class Segment:
 
 
 class Segments:
-    """All segments of a scene, parents first.
-
-    Attributes:
-        warps: number of warps that work on a world. stages: number of stages, with a barrier between any two.
-    """
+    """All segments of a scene, parents first."""
 
     def __init__(self, links: Links):
         self.all: list[Segment] = []
@@ -108,45 +97,15 @@ class Segments:
                     above.children.append(segment)
             segment.links.append(link)
             self.by_link[id(link)] = segment
-        leaves = [segment for segment in reversed(self.all) if not segment.children]
-        self.warps = len(leaves)
-        for warp, segment in zip(_warps_of_leaves(leaves), leaves, strict=True):
-            segment.warp = warp
-        for segment in reversed(self.all):
-            if segment.children:
-                self._hand_over(segment)
-        for segment in self.all:
-            if segment.parent is not None:
-                segment.outward = segment.parent.outward + (segment.warp != segment.parent.warp)
-            segment.outward = max(segment.outward, segment.inward)
-        last = max(segment.outward for segment in self.all)
-        for segment in self.all:
-            if not segment.children:
-                segment.outward = last  # equal segments share their code, so they come out together
-        self.stages = last + 1
 
-    def _hand_over(self, segment: Segment) -> None:
-        """Give an inner segment to the warp of the one child that is done last; of several, to the warp with least
-        work.
-
-        Work is compared by the part of a multiprocessor first, because each part issues instructions for its own warps.
-        """
-        last = max(child.inward for child in segment.children)
-        awaited = [child for child in segment.children if child.inward == last]
-        if len(awaited) == 1:
-            segment.warp = awaited[0].warp
-        else:
-            load = [0] * self.warps
-            for other in self.all:
-                if other.index > segment.index or not other.children:
-                    load[other.warp] += other.dof_count
-            below = {other.warp for other in self.all if segment.root is other.root and not other.children}
-            segment.warp = min(below, key=lambda warp: (sum(load[warp % PARTS :: PARTS]), load[warp], -warp))
-        segment.inward = max(child.inward + (child.warp != segment.warp) for child in segment.children)
+    @property
+    def leaves(self) -> list[Segment]:
+        """The segments that carry no other."""
+        return [segment for segment in self.all if not segment.children]
 
     @property
     def distinct_dof_count(self) -> int:
-        """Number of dofs in segments of different structure, each structure counted once; free hinges are left out."""
+        """Number of dofs in segments that are not alike, one of each kind counted; free hinges are left out."""
         kinds = {tuple(link.hinge.name for link in segment.links): segment for segment in self.all}
         return sum(
             len(link.dofs) for segment in kinds.values() for link in segment.links if not link.hinge.unconstrained
@@ -154,35 +113,15 @@ class Segments:
 
     @property
     def shared_code_fraction(self) -> float:
-        """Fraction of the dofs of leaf segments that is in leaf segments of equal hinges, which share their code."""
-        leaves = [segment for segment in self.all if not segment.children]
-        kinds = [tuple(link.hinge.shape for link in segment.links) for segment in leaves]
-        twice = sum(segment.dof_count for segment, kind in zip(leaves, kinds, strict=True) if kinds.count(kind) > 1)
-        return twice / sum(segment.dof_count for segment in leaves)
+        """Share of the segments' dofs that is in segments of which there is another with the same hinges: they share
+        code."""
+        segments = self.leaves
+        kinds = [tuple(link.hinge.shape for link in segment.links) for segment in segments]
+        twice = sum(segment.dof_count for segment, kind in zip(segments, kinds, strict=True) if kinds.count(kind) > 1)
+        return twice / sum(segment.dof_count for segment in segments)
 
     @property
     def longest_path_fraction(self) -> float:
-        """Largest fraction of the links that is on one path from a root to a leaf, which work by segments cannot
-        shorten."""
+        """Largest share of the links that is on one path from a root to a leaf: the time that segments cannot save."""
         paths = [sum(len(each.links) for each in (segment, *segment.ancestors)) for segment in self.all]
         return max(paths) / sum(len(segment.links) for segment in self.all)
-
-
-def _warps_of_leaves(leaves: list[Segment]) -> list[int]:
-    """Return the warp of each leaf: leaves of one kind share a part of the multiprocessor, which fetches its own code.
-
-    Warp w runs on part w % PARTS. Up to PARTS leaves have a part each, in their order.
-    """
-    kinds = [_kind(segment) for segment in leaves]
-    grouped = sorted(range(len(leaves)), key=lambda at: (-kinds.count(kinds[at]), kinds.index(kinds[at])))
-    places = sorted(range(len(leaves)), key=lambda warp: (warp % PARTS, warp))
-    warps = dict(zip(grouped, places, strict=True)) if len(leaves) > PARTS else dict(enumerate(range(len(leaves))))
-    return [warps[at] for at in range(len(leaves))]
-
-
-def _kind(segment: Segment) -> tuple:
-    """Return what is equal for segments that share their code: hinges, and which entries of rotations are 0, 1 or
-    -1."""
-    entries = [[x for row in link.matrix or () for x in row] for link in segment.links]
-    folded = [tuple(x if is_constant(x) and x in (0.0, 1.0, -1.0) else None for x in each) for each in entries]
-    return tuple(zip((link.hinge.shape for link in segment.links), folded, strict=True))

@@ -1,4 +1,4 @@
-"""The state of one symbolic evaluation of a scene: its inputs, where links are placed, and messages between segments.
+"""The state of one symbolic evaluation of a scene: its inputs and where links are placed.
 
 The recursions are functions of a :class:`Trace` that return what they store. ``label`` names in the emitted code which
 link and which letter of the paper a value belongs to.
@@ -15,7 +15,7 @@ from ...trace.scalars import Value
 from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Vector, cross
 from .. import motion, newton_euler
 from ..motion import STILL, VelocityTerms
-from . import messages
+from .exchange import Exchange, WholeTree
 from .links import Link, LinkPlacement, Links, place_link
 from .segments import Segment
 
@@ -30,61 +30,29 @@ class Trace:
         dtype: "float32" or "float64"; pivots are compared with its rounding.
         inputs: names of the arrays that are read: "qd", "tau", "qdd", "body_f", "b"; an array that is not among them is
             zero and costs nothing.
-        segment: trace the work on this segment alone. The motion of its ancestors is computed anew; what it receives
-            from other segments and sends to them goes through the array "sent" or "returned", from ``offset(letter,
-            segment)`` on.
-        offset: first entry of a message, by letter and segment.
+        exchange: what the evaluation works on, and its messages to others; None: it takes the whole tree.
 
     Attributes:
         places: by id of the link: its placement. motions: its velocity terms. axes: its axes in the inertial frame.
         compensates_gravity: external wrenches hold up the bodies' ``gravcomp``, as forces of the hinges do.
         with_step_armature: returns a link with what a time step adds to its armature.
-        final_messages: messages that a segment sends apart from the others, because segments of equal structure do not
-            all send them.
-        final_stores: what a segment stores after it has received the final messages of all others. A list of groups;
-            groups with equal code are emitted as one loop.
-        pass_invariants: values that the passes of a loop share, formed once before the loop.
-        prologue: stores before the passes of a loop, of the variables that they read.
         contact_inertia, contact_force: by id of the link: what contacts add to its articulated inertia, and to the
             forces on it; of a segment also for the link that it moves on.
-        law_stores: stores before each pass: the laws of a dof at its guess. Groups as of ``final_stores``.
-        check_stores: stores that check a pass, in such groups or in one; they read their inputs anew, which keeps no
-            register.
         substitutes: entries that take the place of those of an array, by its name.
         team: of a segment, the pairs of bodies that native code couples between its sweeps. couples: what it stores for
             each couple of bodies that touches, and the entry that says so; kept_between_sweeps: values that both sweeps
             use.
     """
 
-    def __init__(
-        self,
-        links: Links,
-        dtype: str,
-        inputs: tuple[str, ...],
-        segment: Segment | None = None,
-        offset: Callable[[str, Segment], int] | None = None,
-    ):
+    def __init__(self, links: Links, dtype: str, inputs: tuple[str, ...], exchange: Exchange | None = None):
         self.links, self.graph, self.epsilon, self.inputs = links, links.graph, EPSILON[dtype], inputs
-        self.segment, self.offset = segment, offset
-        self.final_messages: list[Store] = []
-        self.final_stores: list[list[Store]] = []
-        self.pass_invariants: list[Value] = []
-        self.prologue: list[Store] = []
+        self.exchange = WholeTree(links) if exchange is None else exchange
         self.contact_inertia: dict[int, Articulated] = {}
         self.contact_force: dict[int, Vector] = {}
-        self.law_stores: list[list[Store]] = []
-        self.check_stores: list[list[Store]] = []
         self.substitutes: dict[str, Callable[[int], Value]] = {}
         self.team: Any = None
         self.couples: list[tuple[int, list[Store]]] = []
         self.kept_between_sweeps: list[Value] = []
-        self._mail: dict[tuple[str, int], list[Value]] = {}  # messages between segments of this trace
-        self.own = set(map(id, links.links if segment is None else segment.links))
-        self.active = set(self.own)
-        above = None if segment is None else segment.links[0].parent
-        while above is not None:
-            self.active.add(id(above))
-            above = above.parent
         self.places: dict[int, LinkPlacement] = {}
         self.motions: dict[int, VelocityTerms] = {}
         self.axes: dict[int, Matrix] = {}
@@ -176,52 +144,20 @@ class Trace:
     @property
     def own_links(self) -> list[Link]:
         """The links of this segment, parents first; all links where the whole tree is traced."""
-        return [link for link in self.links.links if id(link) in self.own]
+        return [link for link in self.links.links if self.exchange.own(link)]
 
     @property
     def active_links(self) -> list[Link]:
         """The links of this segment and those that it moves on, parents first."""
-        return [link for link in self.links.links if id(link) in self.active]
+        return [link for link in self.links.links if self.exchange.needs_motion_of(link)]
 
     @property
     def own_bodies(self) -> list[int]:
         """The bodies on the links of this segment; bodies that do not move count as the first segment's."""
-        carriers = {body: placement.link for body, placement in self.links.placements.items()}
-        rest = self.segment is None or self.segment.index == 0
-        return [body for body, link in carriers.items() if (rest if link is None else id(link) in self.own)]
+        carriers, exchange = {body: placement.link for body, placement in self.links.placements.items()}, self.exchange
+        return [body for body, link in carriers.items() if (exchange.is_first if link is None else exchange.own(link))]
 
-    def send(self, letter: str, segment: Segment, values: Iterable[Value]) -> list[Store]:
-        """Return the stores that send a message of ``segment``; a trace of the whole tree keeps the values instead."""
-        if self.segment is None:
-            self._mail[letter, segment.index] = list(values)
-            return []
-        assert self.offset is not None
-        first = self.offset(letter, segment)
-        return [Store(messages.channel(letter), (first + i,), value) for i, value in enumerate(values)]
-
-    def receive(self, letter: str, segment: Segment) -> list[Value]:
-        """Return the message that ``segment`` sends."""
-        if self.segment is None:
-            return self._mail[letter, segment.index]
-        assert self.offset is not None
-        first = self.offset(letter, segment)
-        return [self.graph.input(messages.channel(letter), first + i) for i in range(messages.size(letter, segment))]
-
-    def from_children(self, link: Link, letter: str, known: dict[int, Any], build: Callable[[list], Any]) -> list[Any]:
-        """Return the results of a link's children: those ``known`` here, or built from messages of other segments."""
-        if self.segment is None or id(link.children[0] if link.children else link) in self.own:
-            return [known[id(child)] for child in link.children]
-        return [build(self.receive(letter, segment)) for segment in self.segment.children]
-
-    def add_contacts(self, link: Link, P: Articulated, z: Vector) -> tuple[Articulated, Vector]:
-        """Return P+ and z+ for a link's parent, with what contacts add to the parent if another segment works on it."""
-        key = id(link.parent)
-        if key in self.own or key not in self.contact_inertia:
-            return P, z
-        return P + self.contact_inertia[key], z - self.contact_force[key]
-
-    def send_to_parent(self, letter: str, link: Link, values: Iterable[Value]) -> list[Store]:
-        """Return the stores that send a result of a link to its parent, if another segment works on the parent."""
-        if self.segment is None or link is not self.segment.links[0] or link.parent is None:
-            return []
-        return self.send(letter, self.segment, values)
+    @property
+    def segment(self) -> Segment | None:
+        """The segment of an evaluation of one, for the code that couples bodies; None: it takes the whole tree."""
+        return None if self.exchange.alone else self.exchange.own_segments[0]

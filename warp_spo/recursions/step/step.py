@@ -23,7 +23,7 @@ from ..articulated_sweeps import expand, reduce
 from ..coordinates import integrate_link
 from ..kinematics import body_states
 from ..model.links import Link
-from ..model.segments import Segment, Segments
+from ..model.segments import Segment
 from ..model.tracing import Trace
 from .actuation import build_joint_laws
 from .joint_laws import Law, add_laws, is_number
@@ -36,8 +36,6 @@ And the number of the pass, from zero."""
 LOOPED = (GUESS, GAIN, MISSED)
 FORCE, RESISTANCE = "force", "resistance"
 """Of the laws of a segment's dofs at their guesses, where loops evaluate them."""
-# dofs of segments that differ; beyond, laws are evaluated in loops, because their statements are fetched too slowly
-MOST_LAWS = 12
 MOST_JOINT_SPACE_DOFS = 10  # dofs; up to so many, passes solve a system that is formed once
 FREE_PASSES, UPDATE_PERIOD = 8, 3
 """After so many passes a dof changes its guess in every third pass only, one dof after the other."""
@@ -62,16 +60,12 @@ class Step:
         self.laws: dict[int, list[Law]] = {}  # by dof
         self.forces: dict[int, Value] = {}
         self.messages: list[Store] = []  # to other segments
-        self._pass_index = {dof: at for at, dof in enumerate(trace.segment.dofs)} if trace.segment else {}
-        self._laws_in_loops = trace.segment is not None and Segments(trace.links).distinct_dof_count > MOST_LAWS
-        if self._laws_in_loops:
+        self.phases = PhaseBuilder()
+        if trace.exchange.laws_in_loops:
             reciprocal(self.h)  # before the loops, each of which would compute it
 
-    def stores(self, qdd: bool, status: bool) -> list[Store]:
-        """Return the stores out = qd', q_out = q'; with ``qdd`` qdd_out = (qd' - qd) / h, with ``status`` the status.
-
-        For a segment, the stores of one pass; stores after the last pass are the trace's ``final_messages``.
-        """
+    def stores(self, qdd: bool, status: bool) -> StepPhases:
+        """Return the stores out = qd', q_out = q'; with ``qdd`` qdd_out = (qd' - qd) / h; with ``status`` that word."""
         trace = self.trace
         trace.with_step_armature = self._with_resistance
         tau = trace.vector("tau")
@@ -91,13 +85,18 @@ class Step:
                 stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
         stores = self.project_state(stores)
         results = [item.value for item in stores]
-        if trace.segment is not None:
-            trace.final_messages = stores + (self._send_status(trace.segment, results) if status else [])
-            return self.messages + looped
-        if status:
+        if not trace.exchange.alone:
+            if status:
+                sent, word = self._send_status(results)
+                self.phases.add_final_messages(sent)
+                if word:
+                    self.phases.add_final_stores(word)
+        elif status:
             trace.graph.step = "status|s"
             stores.append(Store("status", (), self._status_word(results, bool(looped))))
-        return looped + stores
+        self.phases.add_sweep(self.messages + looped)
+        self.phases.add_epilogue(stores)
+        return self.phases.phases
 
     def _accelerations(self, tau: Callable[[int], Value]) -> dict[int, Value]:
         """Return qdd by dof for ``tau``, with the resistances of the active pieces added to Mass."""
@@ -111,7 +110,7 @@ class Step:
     @property
     def _uses_joint_space(self) -> bool:
         """Whether one thread makes several passes over few dofs."""
-        if self.trace.links.scene.dof_count > MOST_JOINT_SPACE_DOFS or self.trace.segment is not None:
+        if self.trace.links.scene.dof_count > MOST_JOINT_SPACE_DOFS or not self.trace.exchange.alone:
             return False
         return any(law.has_bounds for link in self.links for laws in self.joint_laws.laws(link) for law in laws)
 
@@ -119,7 +118,7 @@ class Step:
         """Return the same from a system that is formed once for all passes."""
         system = JointSpace(self.trace)
         pieces: dict[int, Law] = {}
-        self.trace.pass_invariants = [*system.mass.values(), *system.bias.values()]
+        self.phases.add_invariants([*system.mass.values(), *system.bias.values()])
         for link in self.links:
             self.trace.label(link, "r")
             pieces.update(zip(link.dofs, self._active_pieces(link), strict=True))
@@ -149,7 +148,7 @@ class Step:
             placeholder = MASSLESS_RESISTANCE * total(law.scale * law.resistance for law in self.laws[link.dofs[0]])
             held = pieces[0].resistance
             pieces = [pieces[0]._replace(resistance=select(less(0.0, held), held, placeholder))]
-        if self._laws_in_loops:
+        if self.trace.exchange.laws_in_loops:
             pieces = [self._law_in_loop(dof, piece) for dof, piece in zip(link.dofs, pieces, strict=True)]
         self.forces |= {dof: piece.force for dof, piece in zip(link.dofs, pieces, strict=True)}
         return pieces
@@ -158,8 +157,8 @@ class Step:
         """Return the active piece of a dof as it is read in a pass: a loop finds it before, if laws have bounds."""
         if not any(law.has_bounds for law in self.laws[dof]):
             return piece
-        at = (self._pass_index[dof],)
-        self.trace.law_stores.append(_isolate([Store(FORCE, at, piece.force), Store(RESISTANCE, at, piece.resistance)]))
+        at = (self.trace.exchange.place_of(dof),)
+        self.phases.add_law(_isolate([Store(FORCE, at, piece.force), Store(RESISTANCE, at, piece.resistance)]))
         return Law(self._pass_variable(FORCE, dof), self._pass_variable(RESISTANCE, dof))
 
     def _is_massless(self, link: Link) -> bool:
@@ -187,11 +186,11 @@ class Step:
         A segment keeps its guess apart: it computes u anew in every pass, and until then its registers are free.
         """
         apart = any(law.least is not None and law.most is not None for law in self.laws[dof])
-        apart = apart or self.trace.segment is not None
+        apart = apart or not self.trace.exchange.alone
         return self._pass_variable(GUESS if apart else GAIN, dof)
 
     def _pass_variable(self, name: str, dof: int) -> Value:
-        return self.trace.graph.input(name, self._pass_index.get(dof, dof))
+        return self.trace.graph.input(name, self.trace.exchange.place_of(dof))
 
     def _stores_of_pass(self, gains: dict[int, Value]) -> list[Store]:
         """Return the stores at the end of a pass; none for a whole tree without bounded laws.
@@ -200,16 +199,17 @@ class Step:
         anew.
         """
         has_bounds = any(law.has_bounds for laws in self.laws.values() for law in laws)
-        if not has_bounds and self.trace.segment is None:
+        exchange = self.trace.exchange
+        if not has_bounds and exchange.alone:
             return []
         stores, missed, found = [], [], []
         turns: list[list[Store]] = []
         for link in self.links:
             self.trace.label(link, "u")
             for dof in link.dofs:
-                gain, laws, at = gains[dof], self.laws[dof], self._pass_index.get(dof, dof)
+                gain, laws, at = gains[dof], self.laws[dof], exchange.place_of(dof)
                 found.append(Store(GAIN, (at,), gain))
-                if self.trace.segment is None:
+                if exchange.alone:
                     stores.append(found[-1])
                 else:
                     gain = self._pass_variable(GAIN, dof)
@@ -226,9 +226,10 @@ class Step:
                     stores.append(Store(GUESS, (at,), select(self._holds_guess(at), guess, after)))
                     turns[-1].append(stores[-1])
         stores += [Store(MISSED, (0,), total(missed))] if has_bounds else []
-        if self.trace.segment is None:
+        if exchange.alone:
             return stores
-        self.trace.check_stores = list(map(_isolate, turns)) if self._laws_in_loops else [stores]
+        for group in map(_isolate, turns) if exchange.laws_in_loops else [stores]:
+            self.phases.add_check(group)
         return found
 
     def _holds_guess(self, at: int) -> Value:
@@ -251,40 +252,40 @@ class Step:
         known = self._inputs() + self.trace.links.lost_values()
         return select(all_finite(known), select(self._rank_loss(), Status.LOOPS, word), Status.NOT_FINITE)
 
-    def _send_status(self, own: Segment, results: list[Value]) -> list[Store]:
-        """Return the stores that send a segment's status to the first segment, which stores the most severe of all."""
-        trace, graph = self.trace, self.trace.graph
-        graph.step = "status|s"
+    def _send_status(self, results: list[Value]) -> tuple[list[Store], list[Store]]:
+        """Return the stores that send a segment's status to the first segment, and for that the store of the worst
+        one."""
+        trace, exchange = self.trace, self.trace.exchange
+        trace.graph.step = "status|s"
         finite = select(all_finite(self._inputs()), select(all_finite(results), 0.0, Status.PIVOT), Status.NOT_FINITE)
         worst_word = []
         if exchange.is_first:
             worst: Value = 0.0
-            for segment in Segments(trace.links).all:
-                (word,) = trace.receive("S", segment)
+            for segment in exchange.segments:
+                (word,) = exchange.receive("S", segment)
                 worst = select(less(worst, word), word, worst)
             word = self._final_status(worst)
             values = trace.links.lost_values()  # here, because texts of segments of equal structure are equal
             word = select(all_finite(values), word, Status.NOT_FINITE) if values else word
-            trace.final_stores = [[Store("status", (), word)]]
-        return trace.send("S", own, [finite])
+            worst_word.append(Store("status", (), word))
+        return exchange.send("S", exchange.own_segments[0], [finite]), worst_word
 
     def add_bodies(self) -> None:
         """Let a segment store poses_out, velocities_out = body_poses, body_velocities of its bodies after the step.
 
         It reads the state after the step from the segments that its bodies move with.
         """
-        trace, own = self.trace, self.trace.segment
-        assert own is not None, "by whole trees, another kernel computes the states of bodies"
-        after = {
-            (item.array, item.index[0]): item.value for item in trace.final_messages if item.array in ("q_out", "out")
-        }
-        trace.final_messages = trace.final_messages + trace.send("X", own, map(after.__getitem__, _entries(own)))
+        trace, exchange = self.trace, self.trace.exchange
+        assert not exchange.alone, "by whole trees, another kernel computes the states of bodies"
+        own = exchange.own_segments[0]
+        after = {(item.array, item.index[0]): item.value for item in self.phases.phases.epilogue}
+        self.phases.add_final_messages(exchange.send("X", own, map(after.__getitem__, _entries(own))))
         sent: dict[tuple[str, int], Value] = {}
-        for segment in Segments(trace.links).all:
-            sent |= dict(zip(_entries(segment), trace.receive("X", segment), strict=True))
+        for segment in exchange.segments:
+            sent |= dict(zip(_entries(segment), exchange.receive("X", segment), strict=True))
         moved = trace.at({"q": lambda c: sent["q_out", c], "qd": lambda dof: sent["out", dof]})
         found = [item._replace(array="poses_out") if item.array == "out" else item for item in body_states(moved)]
-        trace.final_stores = [*trace.final_stores, found]
+        self.phases.add_final_stores(found)
 
     def _final_status(self, worst: Value) -> Value:
         """Return ``worst``, the most severe word of all segments, or what the last pass adds where they are well."""
@@ -297,7 +298,7 @@ class Step:
         dofs = sorted(dof for link in self.links for dof in link.dofs)
         wide = ((link.coordinate, link.hinge.coordinates) for link in self.links)
         coordinates = sorted(first + c for first, count in wide for c in range(count))
-        own = {*map(id, trace.own_links)} | (set() if trace.segment and trace.segment.index else {id(None)})
+        own = {*map(id, trace.own_links)} | ({id(None)} if trace.exchange.is_first else set())
         bodies = sorted(body for body, placement in trace.links.placements.items() if id(placement.link) in own)
         for name in trace.inputs:
             if name in ("q", "target_q", "q_from"):
