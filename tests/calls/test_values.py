@@ -39,7 +39,7 @@ def test_a_variable_value_is_the_reference_of_each_world(name, kind, device):
     assert_equals(dyn, scene().with_values(**{name: values}), OPERATIONS if kind == "numpy" else ())
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def test_all_variable_values_together(dtype, device):
     more = {"granularity": of_random_scenes()}  # test_granularity_values has the others
     dyn = spo.Dynamics(scene(), WORLDS, device=device, dtype=dtype, variable=NAMES, **more)

@@ -274,7 +274,7 @@ def call(dyn, operation, a, **more):
     return getattr(dyn, operation)(a["q"], *[a[name] for name in OPERATIONS[operation][0]], *frames, **more)
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_kernels_equal_the_reference(dtype, device):
     """Every value of the scene differs in every world; results are written entirely; a NaN stays in its world."""
     scene = zoo.varied(zoo.fork(), WORLDS)
@@ -296,7 +296,7 @@ def test_kernels_equal_the_reference(dtype, device):
         assert np.isnan(out.numpy()[1]).any()
 
 
-@pytest.mark.parametrize("worlds", [1, 2, 65])
+@pytest.mark.parametrize("worlds", slow_unless([65], [1, 2, 65]))
 def test_any_number_of_worlds(worlds, device):
     """Less than a warp, more than two: each world has the bits that it has alone; the last row is not the end."""
     scene = zoo.SCENES["tree10"]()

@@ -58,9 +58,8 @@ SAME = {  # operation -> (arrays, {result: shape}, options)
     "coordinate_rates": ("q qd", {"out": "c"}, {}),
 }  # fmt: skip
 
-QUICK = [name for name in SAME if name not in (
-    "mass_matrix_inverse", "solve_mass_matrix_vjp", "operational_inertia_inverse", "body_reactions"
-)]  # fmt: skip
+LONG = ("mass_matrix_inverse", "solve_mass_matrix_vjp", "operational_inertia_inverse")
+QUICK = [name for name in SAME if name not in LONG]
 """Operations of a quick run. The others take seconds and ask a hinge for nothing that these do not ask it for."""
 
 
