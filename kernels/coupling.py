@@ -28,7 +28,7 @@ VALUES, REPORTS, EXCESS = 3, 5, 4
 beyond the friction cones, pull, lacking push, and the change of forces in the last of SWEEPS rounds."""
 
 
-class Couples(NamedTuple):
+class CoupledPairs(NamedTuple):
     """The pairs of a scene.
 
     Attributes:
@@ -54,7 +54,7 @@ def entries(points: Sequence[int]) -> tuple[int, ...]:
     return tuple(found)
 
 
-def declare(couples: Couples, T: type) -> str:
+def declare(couples: CoupledPairs, T: type) -> str:
     """Return the definition of ``coupling`` and of the thread's arrays that its passes share."""
     c, pairs, bodies = C_TYPE[T], len(couples.bodies), len(couples.blocks)
     number = "f" if T is wp.float32 else ""
@@ -94,7 +94,7 @@ def declare(couples: Couples, T: type) -> str:
     return "\n".join([COLUMN, touches.native(T, *couples.solids.met), text.replace("CONSTANTS", constants), *arrays])
 
 
-def shared_arrays(couples: Couples) -> dict[str, int]:
+def shared_arrays(couples: CoupledPairs) -> dict[str, int]:
     """Return the sizes of the thread's arrays that statements around ``coupling`` write and read, by name."""
     pairs, bodies = len(couples.bodies), len(couples.blocks)
     response = 1 + max((entry for row in couples.blocks for entry in row), default=0)

@@ -14,6 +14,7 @@ from support.granularities import of_random_scenes
 from support.laws import OPERATIONS, TOLERANCE
 from support.quick import slow_unless
 from support.robots import ROBOTS
+from warp_spo.reference.rotations import rotation
 
 SCENES = zoo.SCENES | ROBOTS
 QUICK = ("cartpole", "arm")  # robots that a quick run compiles at the plan's granularity
@@ -173,7 +174,7 @@ def test_momentum_is_conserved_without_gravity(name, device):
     def momentum(sign, h=1e-4):
         q = dyn.integrate(a["q"], a["qd"] + 0.5 * sign * h * qdd, sign * h)
         poses, velocities = dyn.body_poses(q), dyn.body_velocities(q, a["qd"] + sign * h * qdd)
-        R = spo.reference.rotation
+        R = rotation
         total = np.zeros((3, 6))
         for w in range(3):
             for k, body in enumerate(scene.bodies):
@@ -222,8 +223,11 @@ def test_every_entry_is_written(name, operation, dtype, device):
     laws.every_entry_is_written(dyn, operation, laws.states(dyn.scene, 33, dtype=dtype))
 
 
-@pytest.mark.parametrize("operation", OPERATIONS)
-@pytest.mark.parametrize("name", SOME)
+@pytest.mark.parametrize(
+    ("name", "operation"),
+    # an arm without springs has no passive force, whatever q is
+    [pair for pair in itertools.product(SOME, OPERATIONS) if pair != ("arm", "passive_force")],
+)
 def test_worlds_do_not_touch_each_other(name, operation, device):
     dyn = twin(name, 33, "float32", device)
     laws.worlds_do_not_touch_each_other(dyn, operation, laws.states(dyn.scene, 33, dtype="float32"))

@@ -85,7 +85,7 @@ def test_equals_pinocchio(name):
 BUGS = [
     (hybrid, "reduce_link", "z = z + pivot.U * rates[-1]", "z = z + pivot.U * select(held, 0.0, rates[-1])"),
     (hybrid, "expand_link", "pivot.D * qdd[-1]", "dot(pivot.column, pivot.U) * qdd[-1]"),  # no armature
-    (hybrid, "expand_link", "+ head, b)", ", b)"),
+    (hybrid, "expand_link", "+ force_at_rest, b)", ", b)"),
     (hybrid, "factor", "select(held, P.entry(i, j), rest.entry(i, j))", "rest.entry(i, j)"),
 ]
 

@@ -153,7 +153,7 @@ def test_velocity_terms_first(name, granularity, device):
     """Forward dynamics as the plan has it for many worlds on a GPU: bias forces, then the solution; with loads."""
     scene = SCENES[name]()
     dyn = spo.Dynamics(scene, MANY, device=device, dtype="float64", granularity=granularity)
-    dyn.programs.builder.plan = dataclasses.replace(dyn.plan, apart=True)
+    dyn.programs.builder.plan = dataclasses.replace(dyn.plan, bias_first=True)
     arrays = laws.states(scene, MANY)
     laws.equals_reference(dyn, "forward_dynamics", arrays, laws.TOLERANCE["float64"])
     direct = spo.Dynamics(scene, MANY, device=device, dtype="float64", granularity=granularity)

@@ -58,16 +58,14 @@ def test_what_is_the_same_in_all_worlds_folds(monkeypatch):
 
 
 @pytest.mark.parametrize("granularity", ["tree", "node"])
-@pytest.mark.parametrize("varies", [INERTIAS, ("joint_X_p", "joint_X_c"), ("body_mass",)])
-def test_bodies_that_are_fixed_to_a_link(granularity, variable_inertia, device):
+@pytest.mark.parametrize("variable", [INERTIAS, ("joint_X_p", "joint_X_c"), ("body_mass",)])
+def test_bodies_that_are_fixed_to_a_link(granularity, variable, device):
     scene = gripper()
-    dyn = spo.Dynamics(
-        scene, WORLDS, device=device, dtype="float64", granularity=granularity, variable=variable_inertia
-    )
+    dyn = spo.Dynamics(scene, WORLDS, device=device, dtype="float64", granularity=granularity, variable=variable)
     arrays = laws.states(scene, WORLDS)
     for seed in (0, 1):
-        now = scene.with_values(**{name: zoo.varied(scene, WORLDS, seed).values[name] for name in variable_inertia})
-        dyn.set(**{name: now.values[name] for name in variable_inertia})
+        now = scene.with_values(**{name: zoo.varied(scene, WORLDS, seed).values[name] for name in variable})
+        dyn.set(**{name: now.values[name] for name in variable})
         got = laws.numpy_call(dyn, "forward_dynamics", arrays)
         operators = dyn.operators(arrays["q"])
         whole = (operators.H @ operators.phi @ operators.M @ operators.phi.T @ operators.H.T + operators.Delta).dense()

@@ -113,7 +113,7 @@ def test_values_are_set_aside_where_blocks_have_room():
     assert choose(scene, 65536, MEASURED, "float32").spill_slots(routine, size, 4, 4) == 0
     assert many.spill_slots(routine, 2 * size, 8, 4) == 0
     assert many.spill_slots(routine, 2 * size, 4, 4) == 0
-    assert many.spill_slots(routine.bias_first, size, 4, 4) == 0
+    assert many.spill_slots(routine.hints.bias_first, size, 4, 4) == 0
     assert (
         choose(zoo.branched(3), 65536, MEASURED, "float32", variable_inertia=True).spill_slots(routine, size, 4, 4) == 0
     )

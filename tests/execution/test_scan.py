@@ -266,7 +266,7 @@ def test_status_of_a_world_without_inertia(scanned, device):
 
 # -- the cut -----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("length", [1, 3, PATHS])
-def test_stretches_of_random_trees(length):
+def test_path_blocks_of_random_trees(length):
     rng = np.random.default_rng(0)
     for nodes in (1, 2, 7, 40, 150):
         number = rng.permutation(nodes)
@@ -301,7 +301,7 @@ def test_the_plan_scans_deep_trees_in_few_worlds():
     )
     assert "launches in a row against 1200 of sweeps" in plan.describe_recursion(choose(deep, 1, MEASURED))
     assert [choose(deep, worlds, MEASURED).block_length for worlds in (1024, 4096, 16384)] == [16, 64, 256]
-    for scene, worlds, options in ((flat, 1, {}), (deep, 65536, {}), (deep, 1, {"varies": True})):
+    for scene, worlds, options in ((flat, 1, {}), (deep, 65536, {}), (deep, 1, {"variable_inertia": True})):
         assert not choose(scene, worlds, MEASURED, **options).block_length
     assert not choose(deep, 1, MEASURED, granularity="node").block_length  # bits do not depend on the number of worlds
     assert not choose(deep, 1, MEASURED, recursion="sweep").block_length

@@ -15,6 +15,7 @@ from support.routines import ROUTINES
 from support.segments_of_trees import TREES, hand
 from warp_spo.execution import plan
 from warp_spo.execution.segment import shared_code
+from warp_spo.execution.segment.schedule import Schedule
 from warp_spo.kernels import straight_line
 from warp_spo.recursions.model import shared_constants
 from warp_spo.recursions.model.links import Links
@@ -37,18 +38,21 @@ def test_segments_are_chains(name):
         assert all(
             child.index > segment.index and child.links[0].parent is segment.links[-1] for child in segment.children
         )
-    leaves = [segment.warp for segment in segments.all if not segment.children]
-    assert sorted(leaves) == [*range(segments.warps)]
+    schedule = Schedule(segments)
+    leaves = [schedule.assignments[segment.index].warp for segment in segments.leaves]
+    assert sorted(leaves) == [*range(schedule.warps)]
 
 
 @pytest.mark.parametrize("name", TREES)
 def test_segments_wait_for_each_other(name):
     """A warp reads results of other warps only from earlier stages; within a warp, inward comes before outward."""
-    for segment in (segments := Segments(Links(TREES[name]()))).all:
-        assert 0 <= segment.inward <= segment.outward < segments.stages
-        for child in segment.children:
-            assert child.inward + (child.warp != segment.warp) <= segment.inward
-            assert segment.outward + (child.warp != segment.warp) <= child.outward
+    schedule = Schedule(Segments(Links(TREES[name]())))
+    for segment in schedule.segments.all:
+        own = schedule.assignments[segment.index]
+        assert 0 <= own.inward <= own.outward < schedule.stages
+        for child in (schedule.assignments[one.index] for one in segment.children):
+            assert child.inward + (child.warp != own.warp) <= own.inward
+            assert own.outward + (child.warp != own.warp) <= child.outward
 
 
 SEGMENTED = {"forward_dynamics": ("qd", "tau", "body_f"), "inverse_dynamics": ("qd", "qdd", "body_f"),
@@ -249,7 +253,7 @@ def test_steps_are_named_in_the_code(monkeypatch):
     dyn = spo.Dynamics(scene, 1, device="cpu", dtype="float64", granularity="tree")
     rate = (1, scene.dof_count)
     dyn.programs.find(ROUTINES["forward_dynamics"], {"q": (1, scene.coord_count), "qd": rate, "tau": rate}, rate)
-    for label in scene.body_labels[1:]:  # the pedestal does not move
-        assert f"// {label}" in texts[-1].cpu
+    for body in range(1, scene.body_count):  # the pedestal does not move
+        assert f"// body {body}\n" in texts[-1].cpu
     names = re.findall(r"double (\w+) =", texts[-1].cpu)
     assert {"x", "w", "P", "z", "a"} <= {name.rstrip("0123456789") for name in names}

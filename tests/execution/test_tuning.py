@@ -264,21 +264,21 @@ def test_only_what_the_plan_knows_is_a_candidate():
 def test_sweeps_and_scans_are_a_choice_for_all_operations(device, monkeypatch):
     """Where the plan is granularity node; copies keep it, and results are those of the recursion if it is forced."""
     monkeypatch.setattr(plan, "MOST_DOFS", 4)
-    scene, stretches = zoo.chain(7), []
+    scene, lengths = zoo.chain(7), []
     us = {0: 5.0, 4: 2.0, 7: 3.0}
 
     def seconds(call, device):
         scan = call.args[0].recursions.scan
-        stretches.append(scan._length if scan else 0)
-        return 1e-6 * us[stretches[-1]]
+        lengths.append(scan._length if scan else 0)
+        return 1e-6 * us[lengths[-1]]
 
     monkeypatch.setattr(tuning, "_seconds", seconds)
     dyn = made(device, scene)
-    assert dyn.granularity == "node" and set(dyn.plan.stretches(scene).values()) == {0, 4, 7}
+    assert dyn.granularity == "node" and set(dyn.plan.block_lengths(dyn.scene).values()) == {0, 4, 7}
     state = zoo.random_state(scene, WORLDS)
     first = dyn.recursions.scan
     found = dyn.tune(["forward_dynamics", "mass_matrix"])
-    assert found["recursion"].granularity == "scan of 4" and sorted(stretches) == [0, 4, 7]
+    assert found["recursion"].granularity == "scan of 4" and sorted(lengths) == [0, 4, 7]
     assert found["mass_matrix"].granularity == "node" and dyn.recursions.scan is not first
     assert "tuned        recursion: scan of 4 2 us, scan of 7 3 us, sweep 5 us" in dyn.explain()
     forced = made(device, scene, recursion="scan")
@@ -286,7 +286,7 @@ def test_sweeps_and_scans_are_a_choice_for_all_operations(device, monkeypatch):
     assert np.array_equal(*results)
     copy = pickle.loads(pickle.dumps(dyn))
     assert copy.recursions.scan._length == 4 and copy.plan.tuned == dyn.plan.tuned
-    assert made(device, scene).tune("mass_matrix")["recursion"].granularity == "scan of 4" and len(stretches) == 3
+    assert made(device, scene).tune("mass_matrix")["recursion"].granularity == "scan of 4" and len(lengths) == 3
     us[0] = 1.0
     assert made(device, scene, recursion="sweep").tune("mass_matrix").keys() == {"mass_matrix"}  # it was asked for
 

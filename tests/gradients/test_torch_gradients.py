@@ -163,8 +163,8 @@ BUGS = {
         "{dof: pushed[1](dof) for dof in dofs}",
     ),
     "the sign of lambda": (adjoints, "forward_dynamics_vjp", "lambda dof: -solved(dof)", "lambda dof: solved(dof)"),
-    "the turn of a quaternion": (Ball, "tangent", "cross(u, g_u)", "cross(g_u, u)"),
-    "the arm of a free hinge": (Free, "tangent", "turn - cross(", "turn + cross("),
+    "the turn of a quaternion": (Ball, "to_tangent", "cross(u, g_u)", "cross(g_u, u)"),
+    "the arm of a free hinge": (Free, "to_tangent", "turn - cross(", "turn + cross("),
 }
 
 

@@ -183,7 +183,10 @@ def test_messages_on_the_page_of_questions_stand_in_the_code(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
     messages = importlib.import_module("messages")
     known = [text for rows in messages.rooms().values() for _, text in rows]
-    known += [(ROOT / "warp_spo" / "errors.py").read_text(), (ROOT / "warp_spo" / "newton" / "files.py").read_text()]
+    known += [
+        (ROOT / "warp_spo" / "errors.py").read_text(),
+        (ROOT / "warp_spo" / "newton" / "files" / "load.py").read_text(),
+    ]
     assert len(known) > 400
     text = (ROOT / "docs" / "questions.md").read_text().partition("## Errors")[2]
     shown = re.findall(r"^\| `([^|]+)` \|", text, re.MULTILINE)

@@ -50,7 +50,7 @@ BODY_POSES = Operation(
     "body_poses",
     arguments=(Q,),
     results=(POSES,),
-    routine=Routine("body_poses", recursion.body_poses, node_operations.body_poses, suits=_anchors_fixed),
+    routine=Routine("body_poses", recursion.body_poses, node_operations.body_poses, supports=_anchors_fixed),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,
     derivative=Derivative(
@@ -111,7 +111,7 @@ BODY_STATES = Operation(
         "body_states",
         recursion.body_states,
         node_operations.body_states,
-        suits=_anchors_fixed,
+        supports=_anchors_fixed,
         segments=SegmentForm(wide=True),
     ),
     embed=AS_WRITTEN,
@@ -140,7 +140,7 @@ FRAME_POSES = Operation(
     "frame_poses",
     arguments=(Q, ORIENTED_FRAMES),
     results=(Result("poses", "world, frame, 7", quaternions=lambda scene: [3, 10]),),  # of the two frames of trials
-    routine=Routine("frame_poses", recursion.frame_poses, node_operations.frame_poses, suits=_anchors_fixed),
+    routine=Routine("frame_poses", recursion.frame_poses, node_operations.frame_poses, supports=_anchors_fixed),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,
     derivative=Derivative(

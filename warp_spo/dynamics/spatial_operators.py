@@ -37,7 +37,7 @@ EXPRESSION = Routine(
     "expression",
     recursion.expression,
     blocks=True,
-    suits=lambda links, shapes, expression: expressions.spaces_agree(expression),
+    supports=lambda links, shapes, expression: expressions.spaces_agree(expression),
     variants=64,
     title=lambda inputs, expression: expressions.format_expression(expression),
 )

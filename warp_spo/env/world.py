@@ -336,9 +336,9 @@ class World:
             reset: their value at the start of an episode; None: a reset leaves them alone, and they start from zero.
         """
         self._layout.remember(name, size, reset)
-        return self.kept[name] if name in self.kept else self.remembered(name)
+        return self.kept[name] if name in self.kept else self.stored_memory(name)
 
-    def remembered(self, name: str) -> Vector:
+    def stored_memory(self, name: str) -> Vector:
         """Return numbers of :meth:`memory` as they were before this stage."""
         start, size, _ = self._layout.memory[name]
         return vector(self._scalar("memory", start + i) for i in range(size))

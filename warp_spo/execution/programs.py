@@ -135,7 +135,7 @@ class Programs:
         """Return the program of a job; None where sweeps serve it, or another kernel has to write states of bodies."""
         routine, inputs, options = job.routine, job.inputs, job.options
         links = self.builder.own_links(options)
-        if not links.links or not routine.suits(links, inputs, **options):
+        if not links.links or not routine.supports(links, inputs, **options):
             return None
         if routine.start is not None:
             return multi_start.build(self, routine, links, "given" in inputs, options)

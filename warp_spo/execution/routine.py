@@ -92,7 +92,8 @@ class Routine:
         sweeps: ``sweeps(run, out, **arrays)`` launches the same computation at node granularity; None: there is only
             the traced kernel of the scene.
         blocks: at node granularity the caller applies stored blocks instead of this routine.
-        suits: ``suits(links, shapes, **options)``, whether the traced kernel serves this scene; if not, the sweeps do.
+        supports: ``supports(links, shapes, **options)``, whether the traced kernel serves this scene; if not, the
+            sweeps do.
         start: ``start(trace, **options)`` returns what a search starts from; None: the kernel is no search, see
             :mod:`.multi_start`.
         title: ``title(inputs, **options)``, what a user calls this computation; None: the name.
@@ -106,7 +107,7 @@ class Routine:
     trace: Callable[..., list[Store] | StepPhases]
     sweeps: Callable[..., None] | None = None
     blocks: bool = False
-    suits: Callable[..., bool] = _always
+    supports: Callable[..., bool] = _always
     start: Callable[..., list[Store]] | None = None
     title: Callable[..., str] | None = None
     variants: int = VARIANTS

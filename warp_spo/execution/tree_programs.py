@@ -75,7 +75,11 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
 
 
 def _coupled_step(
-    builder: Builder, layout: KernelLayout, couples: couple_points.Couples, parts: list[str], entries: dict[str, int]
+    builder: Builder,
+    layout: KernelLayout,
+    couples: couple_points.Couples,
+    parts: list[str],
+    entries: dict[str, int],
 ) -> tuple[KernelLayout, str, str]:
     """Return the layout and the code, for CUDA and for the CPU, of a step in which aggregates couple bodies.
 
@@ -93,11 +97,11 @@ def _coupled_step(
     return team, couple_points.text(couples, parts, entries, T, warps), cpu
 
 
-def _couples(links: Links) -> coupling.Couples:
+def _couples(links: Links) -> coupling.CoupledPairs:
     """Return the pairs of bodies of a scene as their native code needs them."""
     scene, of_pairs = links.scene, pairs.members(links).of_pairs
     points, eps = zip(*((pair.points, pair.eps) for pair in scene.contact_pairs), strict=True)
-    return coupling.Couples(
+    return coupling.CoupledPairs(
         of_pairs, points, eps, tuple(pairs.inverse_weights(scene)), pairs.blocks(links), pairs.solids_of(links)[0]
     )
 

@@ -15,9 +15,9 @@ from .pickling import Stored
 
 CONTACT_VALUES = ("contact_friction", "contact_stiffness", "contact_damping")
 """Names of a scene's values that come from its contacts, one entry a point."""
-SINK = 1.7e-3  # how far a robot sinks in [m] that rests on its points, where the stiffness is chosen
-RESTS = 4  # points at most on which a robot rests
-STANCE = 2  # bodies at most whose points, up to RESTS each, carry a robot
+STATIC_SINK = 1.7e-3  # how far a robot sinks in [m] that rests on its points, where the stiffness is chosen
+POINTS_AT_REST = 4  # points at most on which a robot rests
+BODIES_AT_REST = 2  # bodies at most whose points, up to POINTS_AT_REST each, carry a robot
 MARGIN = 1.6  # of the moment that holds up one leg, over what tips it: 360 N m/rad of 226 for a humanoid of 33 kg
 DAMPING = 0.5  # of sqrt(k m), the share of mass over one point; standing is quiet from 0.1 to 2
 STANDARD_GRAVITY = 9.81  # [m/s^2], in scenes without gravity
@@ -76,21 +76,23 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
         contact, tree = scene.contacts[point.contact], stand.roots == stand.roots[point.body]
         mass, own = float(stand.masses[tree].sum()), at[bodies == point.body]
         com = stand.masses[tree] @ stand.coms[tree] / mass if mass else own.mean(axis=0)
-        rests = min(RESTS, int(tree[bodies].sum()))
+        rests = min(POINTS_AT_REST, int(tree[bodies].sum()))
         k = contact.stiffness
         if k is None:
-            k = max(mass * stand.gravity / (rests * SINK), _sole_stiffness(own, mass * stand.gravity, com, stand.up))
+            k = max(
+                mass * stand.gravity / (rests * STATIC_SINK), _foot_stiffness(own, mass * stand.gravity, com, stand.up)
+            )
             k = k or 1.0  # of massless bodies
         d = contact.damping if contact.dissipation is None else contact.dissipation
         if d is None:
-            shared = max(rests, min(STANCE, len(set(bodies[tree[bodies]]))) * min(len(own), RESTS))
+            shared = max(rests, min(BODIES_AT_REST, len(set(bodies[tree[bodies]]))) * min(len(own), POINTS_AT_REST))
             d = DAMPING * np.sqrt(k * mass / shared)
         for name, value in zip(CONTACT_VALUES, (contact.friction, k, d), strict=True):
             values[name][0, i] = value
     return {name: read_only(value) for name, value in values.items()}
 
 
-def _sole_stiffness(points: np.ndarray, weight: float, com: np.ndarray, up: np.ndarray) -> float:
+def _foot_stiffness(points: np.ndarray, weight: float, com: np.ndarray, up: np.ndarray) -> float:
     """Return k with n k b^2 = MARGIN m g l: the points of one body hold up the robot above; 0 without a sole.
 
     b is half the width of the points across their longest extent, l how far the centre of mass lies above them.

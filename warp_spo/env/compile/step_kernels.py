@@ -210,7 +210,7 @@ class Tracing:
         self, w: World, q: Vector, qd: Vector, changed: World, due: Condition, name: str
     ) -> tuple[Vector, Vector]:
         """Return the state after an event, which is that of ``changed`` where ``due`` holds, and keep what it kept."""
-        olds = [w.kept.get(each, w.remembered(each)) for each in changed.kept]
+        olds = [w.kept.get(each, w.stored_memory(each)) for each in changed.kept]
         news = np.concatenate([changed.q, changed.qd, *changed.kept.values()])
         found = choose(due, news, np.concatenate([q, qd, *olds]), name)
         sizes = [len(q), len(qd), *map(len, olds)]
@@ -339,7 +339,7 @@ class Tracing:
         if self.observed.kept:  # a look at worlds that go on, after a reset of others, is not a step of theirs
             goes = (self.observed.read("advance", 1)[0] > 0.5) | self.observed.fresh
             for name, values in self.observed.kept.items():
-                old = self.observed.remembered(name)
+                old = self.observed.stored_memory(name)
                 self._keep(self.observed, name, vector(where(goes, a, b) for a, b in zip(values, old, strict=True)))
         for name, (_, _, update) in self.layout.sensors.items():
             if name not in self.judge.kept:
