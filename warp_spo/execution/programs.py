@@ -146,7 +146,7 @@ class Programs:
         if routine.hints.bias_first is not None and self.plan.at(routine).bias_first and "qd" in inputs:
             job = job._replace(routine=routine.hints.bias_first)
         ways = [dict(alone=False)] if shared else []
-        if routine.couples_bodies and divides and not coupled.suits(links):
+        if routine.couples_bodies and divides and not coupled.is_supported(links):
             ways += [dict(alone=True), dict(alone=True, local=True)]
         segments = Segments(links) if ways else None
         for way in ways:

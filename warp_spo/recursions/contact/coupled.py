@@ -38,7 +38,7 @@ FIELDS, EXCESS = 5, 3  # of a pair's report: force, gap, slip; of the world's: b
 MOST_WORK = 15_000  # products of an elimination, whose code has no loops; 8 pairs between limbs of seven dofs are 8,000
 
 
-def suits(links: Links) -> bool:
+def is_supported(links: Links) -> bool:
     """Whether aggregates couple the pairs of a scene: links share no dofs, all pairs move, code is not too long."""
     pairs = ((links.placements[body].link if body >= 0 else None for body in (p.body, p.other))
              for p in links.scene.contact_pairs)  # fmt: skip

@@ -24,7 +24,7 @@ from ..model.messages import INWARD, OUTWARD
 from ..model.segments import Segment, Segments
 from ..motion import STILL
 from ..step.phases import StepPhases
-from .coupled import CoupledStep, suits
+from .coupled import CoupledStep, is_supported
 from .couples import EXCESS, Team
 from .pairs import (
     RESIDUAL,
@@ -289,6 +289,6 @@ class PairedSegment(ContactStepTrace):
 
 def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> StepPhases:
     """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world; and the ``reports``"""
-    alone = CoupledStep if suits(trace.links) else PairedStep
+    alone = CoupledStep if is_supported(trace.links) else PairedStep
     form = alone if trace.segment is None else PairedSegment
     return form(trace, reports).stores(qdd, status)
