@@ -116,7 +116,7 @@ def test_a_heavy_cube_on_light_ones(device):
 def test_more_pairs_than_are_solved_together(monkeypatch, device, together):
     """Aggregates solve all; otherwise eight are exact, ten as near as the residual says. Momentum is kept."""
     for module in (coupled, pair_pieces):
-        monkeypatch.setattr(module, "suits", lambda links: together)
+        monkeypatch.setattr(module, "is_supported", lambda links: together)
     for count, pairs in ((9, 8), (11, 10)):
         scene, q, qd = cubes_in_a_row(count)
         dyn, residual = spo.Dynamics(scene, 2, device=device, dtype="float64"), np.full(2, np.nan)

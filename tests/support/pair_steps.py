@@ -51,6 +51,6 @@ def plant(monkeypatch, place, old, new, text="NATIVE"):
 
 def respond_by_whole_trees(monkeypatch):
     """Let kernels find the response to pairs by sweeps over whole trees, as where limbs and aggregates cannot share."""
-    for each in ("suits", "by_limbs"):
+    for each in ("is_supported", "by_limbs"):
         monkeypatch.setattr(pair_pieces, each, lambda scene: False)
-    monkeypatch.setattr(coupled, "suits", lambda links: False)
+    monkeypatch.setattr(coupled, "is_supported", lambda links: False)
