@@ -136,15 +136,15 @@ BUGS = {
     "what a limb hands on": (
         PassGradient,
         "stores",
-        'trace.receive("G", segment)[: len(self.passed_on)]',
+        'trace.exchange.receive("G", segment)[: len(self.passed_on)]',
         "[0.0] * len(self.passed_on)",
     ),
     "what points on the trunk hand on": (PassGradient, "_carry", "if link is not self._under:", "if True:"),
     "how inertias count": (
         PassSolve,
         "_tell",
-        'trace.send("Q", segment, gradients)',
-        'trace.send("Q", segment, [0.0] * len(ways))',
+        'exchange.send("Q", segment, gradients)',
+        'exchange.send("Q", segment, [0.0] * len(gradients))',
     ),
     "how inertias count in memory": (
         PassGradient,

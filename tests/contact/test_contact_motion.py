@@ -45,7 +45,8 @@ def rollout(scene, q, qd, h, seconds, target, device, passes=None, **values):
     report = {name: np.full((worlds, *shape), np.nan) for name, shape in REPORTS.items()}
     found = {name: [] for name in (*REPORTS, "q", "qd", "energy")}
     for _ in range(round(seconds / h)):
-        after = dyn.step(q, qd, None, h, target_q=target, options=spo.StepOptions(passes=passes), **report)
+        options = spo.StepOptions(passes=passes)
+        after = dyn.step(q, qd, None, h, target_q=target, options=options, report=spo.StepReport(**report))
         energy = dyn.kinetic_energy(q, qd) + dyn.potential_energy(q) + springs(scene, q, target)
         energy = energy + 0.5 * (k * np.maximum(-report["contact_gap"], 0.0) ** 2).sum(axis=1)
         for name, array in (*report.items(), ("q", q), ("qd", qd), ("energy", energy)):

@@ -219,7 +219,7 @@ BUGS = {
     "what a message leaves out": (SegmentExchange, "add_contacts", "z - pushes[key]", "z"),
     "excess of one limb": (step.ContactStepTrace, "_send_to_the_first", "largest(list(values))", "values[0]"),
     "no barrier after the passes": (pass_loops, "count_team_passes", '"}", barrier]', '"}"]'),
-    "no barrier ahead": (warp_specialized.WarpSpecializedKernel, "_ahead", "[BARRIER] if stage else []", "[]"),
+    "no barrier ahead": (warp_specialized.WarpSpecializedKernel, "_before_passes", "[BARRIER] if stage else []", "[]"),
 }
 
 

@@ -37,7 +37,7 @@ def test_prepared_ahead_nothing_is_compiled(device, monkeypatch):
         loaded = {"body_f": True} if operation in ("forward_dynamics", "inverse_dynamics", "step") else {}
         driven = {"target_q": True, "target_qd": True} if operation == "step" else {}
         frames = {"frames": options(operation)["frames"]} if operation == "jacobian" else {}
-        dyn.prepare(operation, **loaded, **driven, **frames, **({"qdd": True} if operation == "step" else {}))
+        dyn.prepare(operation, **loaded, **driven, **frames, **({"report": ("qdd",)} if operation == "step" else {}))
         mass = () if operation in ("integrate", "jacobian", "body_velocities") else ("body_mass",)
         dyn.prepare(f"{operation}_vjp", wrt=(*arguments, *mass), **frames)
     for product in ("forward_dynamics", "inverse_dynamics"):
