@@ -1,7 +1,7 @@
-"""Facts about the loops of a scene, found once on the host: which rows count, and which dofs are independent.
+"""Facts about the loops of a scene, found once on the host: which rows and which dofs are independent.
 
-Configurations are drawn at random and closed by damped least squares in float64; rank and independence are what the
-Jacobians of the closures say there. The draw is the same every time.
+Random configurations are moved onto the closures by damped least squares in float64. The Jacobians of the closures at
+these samples give the rank and the independent dofs. The random numbers are the same every time.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class ClosureEvaluator:
         ]
 
     def at(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """g [world, row] and Y [world, row, dof] at q [world, coordinate]."""
+        """Return g [sample, row] and Y [sample, row, dof] at q [sample, coordinate]."""
         stores = self._error + self._jacobian
         values = evaluate([item.value for item in stores], lambda _, index: q[:, index[0]])
         g, Y = np.zeros((len(q), self.size)), np.zeros((len(q), self.size, self.scene.dof_count))
@@ -66,6 +66,7 @@ class ClosureEvaluator:
         return g, Y
 
     def moved(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Return q [sample, coordinate] after a small step of the dofs [sample, dof]."""
         arrays = {"q": q, "step": step}
         values = evaluate([value for _, value in self._moved], lambda name, index: arrays[name][:, index[0]])
         new = q.copy()
@@ -74,12 +75,16 @@ class ClosureEvaluator:
         return new
 
     def closed(self, q: np.ndarray) -> np.ndarray:
-        """Those of the configurations [world, coordinate] that could be closed, closed."""
+        """Move configurations [sample, coordinate] onto the closures, and return those for which this succeeded.
+
+        Each sample takes STEPS steps of damped least squares (Levenberg-Marquardt): a step that makes |g| smaller is
+        kept and lowers the damping, any other is dropped and raises it.
+        """
         damping = np.full(len(q), 1e-3)
         g, Y = self.at(q)
         for _ in range(STEPS):
-            lifted = Y @ Y.transpose(0, 2, 1) + damping[:, None, None] * np.eye(self.size)
-            step = -(Y.transpose(0, 2, 1) @ np.linalg.solve(lifted, g[..., None]))[..., 0]
+            damped = Y @ Y.transpose(0, 2, 1) + damping[:, None, None] * np.eye(self.size)
+            step = -(Y.transpose(0, 2, 1) @ np.linalg.solve(damped, g[..., None]))[..., 0]
             tried = self.moved(q, step)
             g_tried, Y_tried = self.at(tried)
             better = np.linalg.norm(g_tried, axis=1) < np.linalg.norm(g, axis=1)
@@ -90,7 +95,13 @@ class ClosureEvaluator:
 
 
 def drawn(scene: Scene, count: int, seed: int = 0) -> np.ndarray:
-    """Random coordinates [count, coordinate]: within limits, else in (-1.5, 1.5) [rad, m]; any rotation."""
+    """Return random samples of the configuration [sample, coordinate], the same for equal arguments.
+
+    Coordinates are uniform within their limits, no further than 3.2 from zero, or in (-1.5, 1.5) where a limit is
+    missing [rad, m]. Quaternions are uniform over all rotations; the other coordinates of their hinges stay neutral.
+    Every other sample is then shrunk to a tenth of its distance from the neutral configuration, in which robots are
+    usually modelled. Shrunk quaternions are not normalised.
+    """
     rng = np.random.default_rng(seed)
     q = np.tile(scene.neutral_q, (count, 1))
     lower, upper = (scene.values[f"joint_limit_{side}"][0] for side in ("lower", "upper"))
@@ -104,13 +115,16 @@ def drawn(scene: Scene, count: int, seed: int = 0) -> np.ndarray:
             bounded = lower[dof + i] > -UNLIMITED and upper[dof + i] < UNLIMITED and lower[dof + i] < upper[dof + i]
             low, high = (lower[dof + i], upper[dof + i]) if bounded else (-1.5, 1.5)
             q[:, coordinate + i] = rng.uniform(max(low, -3.2), min(high, 3.2), count)
-    small = q[::2]  # every other one near the neutral configuration, from which robots are drawn
-    q[::2] = scene.neutral_q + 0.1 * (small - scene.neutral_q)
+    near_neutral = q[::2]
+    q[::2] = scene.neutral_q + 0.1 * (near_neutral - scene.neutral_q)
     return q
 
 
 def usual_rank(scene: Scene) -> int:
-    """Independent rows where the loops close, but for change points; 0 if no configuration that closes was found."""
+    """Return how many rows are independent where the loops close, other than at change points.
+
+    The result is 0 if no closed configuration was found.
+    """
     closing = ClosureEvaluator(scene)
     q = closing.closed(drawn(scene, SAMPLES))
     if len(q) == 0 or closing.size == 0:

@@ -33,9 +33,13 @@ QUASI_VELOCITIES = Operation(
 def quasi_velocities(self: Dynamics, q: ArrayT, qd: AnyArray, out: ArrayT | None = None) -> ArrayT:
     """Compute nu = sqrt(D) [I + H phi K]* qd, in which the kinetic energy is nu . nu / 2 (armature included).
 
-    [I + H phi K] is formed dof by dof, and later dofs of a hinge are eliminated first: it is the unit upper triangular
-    factor U of Mass = U D U*, where dofs nearer to the root come first. Jain, Rodriguez 1995, "Diagonalized Lagrangian
-    robot dynamics".
+    U = [I + H phi K] is the unit upper triangular factor of Mass = U D U*, in the order in which dofs nearer to the
+    root come first; D is diagonal, and * is the transpose. The factorization goes dof by dof and eliminates later dofs
+    of a hinge first. Jain, Rodriguez 1995, "Diagonalized Lagrangian robot dynamics".
+
+    Args:
+        q: [world, coordinate].
+        qd: [world, dof].
 
     Returns:
         [world, dof], [sqrt(kg) m/s]; NaN where D is not positive.

@@ -191,9 +191,10 @@ class SpatialOperators(LetterOwner):
         return composite
 
     def change_variables(self, B: Blocks) -> SimilarOperators:
-        """Return the operators for vectors x' = B x over the nodes; they follow each :meth:`update`.
+        """Return the operators in the variables x' = B x, for vectors x of forces over the nodes.
 
-        phi' = B phi B^-1, H' = H B^-1, M' = B M B*. The articulated-body recursion runs in the new variables. D, the
+        Vectors of motions change by the inverse of B*, the transpose of B. phi' = B phi B^-1, H' = H B^-1, M' = B M B*.
+        The operators follow each :meth:`update`. The articulated-body recursion runs in the new variables. D, the
         mass matrix and all else that maps hinges to hinges stay the same up to rounding.
 
         Args:

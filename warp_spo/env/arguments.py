@@ -123,7 +123,12 @@ def checked_actions(call: str, actions: Any, worlds: int, labels: list[str]) -> 
 
 
 def checked_mask(call: str, mask: Any, worlds: int, device: torch.device) -> torch.Tensor:
-    """Return a mask of worlds as a tensor on the device; ValueError for what is none."""
+    """Return a mask of worlds as a bool tensor [world] on the device.
+
+    Raises:
+        TypeError: the mask cannot become a tensor.
+        ValueError: it has another shape or dtype.
+    """
     try:
         found = torch.as_tensor(mask, device=device)
     except (TypeError, ValueError, RuntimeError):

@@ -318,6 +318,12 @@ class Env(VecEnv):
         return found
 
     def _launch(self, name: str) -> None:
+        """Launch the kernels of a stage ("act", "judge", "observe", ...) on all worlds, on torch's current stream.
+
+        A CUDA graph that is being captured holds them side by side if the worlds are too few for one kernel to fill the
+        GPU, and no kernel overwrites what another one reads. Otherwise they run one after the other.
+        """
+
         def run(kernel: Launch) -> None:
             with self._stream():
                 kernel(self.num_envs)
@@ -347,6 +353,7 @@ class Env(VecEnv):
         return [Part(self._physics), *final, *after, Part(lambda: self._launch("judge")), *last]
 
     def _physics(self) -> None:
+        """Compute the controls from the actions, and step the dynamics of all worlds in place."""
         self._launch("act")
         controls = self._controls
         self.dyn.step(

@@ -72,16 +72,26 @@ def reach(env: Env, policy: Policy, frame: str, period: float) -> dict[str, floa
 
 
 def tracking(env: Env, policy: Policy, seconds: float = 20.0, command: Any = None) -> dict[str, float]:
-    """Return the mean errors of a base that follows velocities [m/s, rad/s], and the share of worlds that fall."""
+    """Return how well the base follows the velocities of the command, over the first episode of each world.
+
+    Args:
+        seconds: length of the rollout [s].
+        command: the velocities forward and to the left [m/s], and the rate of turning [rad/s]; None: the environment's.
+
+    Returns:
+        Means over steps and worlds: the error of the horizontal velocity [m/s], that of the rate of turning [rad/s],
+        the velocity forward [m/s] and the height of the base [m]. "falls" is the share of worlds that any termination
+        ended.
+    """
     wanted = lambda env: env.command.clone()  # noqa: E731
-    read = {"is": base_rates, "wanted": wanted, "height": lambda env: env.q[:, 2]}
+    read = {"rates": base_rates, "wanted": wanted, "height": lambda env: env.q[:, 2]}
     found = roll(env, policy, round(seconds / env.step_dt) - 1, read, command)
-    error, valid = found["is"] - found["wanted"], found["valid"]
+    error, valid = found["rates"] - found["wanted"], found["valid"]
     return {
         "worlds": env.num_envs,
         "velocity error": mean(error[..., :2].norm(dim=2), valid),
         "turning error": mean(error[..., 2].abs(), valid),
-        "forward": mean(found["is"][..., 0], valid),
+        "forward": mean(found["rates"][..., 0], valid),
         "falls": float(found["ended"].float().mean()),
         "height": mean(found["height"], valid),
     }

@@ -58,32 +58,37 @@ def describe(env: Env, name: str) -> dict[str, Any]:
 
 
 def controls_of(env: Env) -> tuple[np.ndarray, np.ndarray, dict[str, list]]:
-    """Return scale and offset of each action, as the environment's own stage computes them, and what it sets.
+    """Return scale and offset of each action, and the gains of the joint or actuator that the action controls.
 
-    The last are lists by name, a number for each action; None where there is no limit. Worlds start anew.
+    An action sets one control, control = offset + scale * action. Both numbers are measured: the environment computes
+    its controls for actions at a base point, and again with each action moved by itself. The gains are lists by name
+    (stiffness, damping, ...) with an entry for each action; a force limit that does not exist is None.
+
+    The environment is reset afterwards.
     """
     scene, rows = env.scene, []
     clips = [(-np.inf, np.inf) if clip is None else clip for clip in env.action_clips]
-    start = np.array([min(max(0.0, low), high) for low, high in clips])
-    step = np.array([min(0.5, high - at) or low - at for at, (low, high) in zip(start, clips, strict=True)])
-    given = torch.tensor(start + np.vstack([np.zeros(len(step)), np.diag(step)]), dtype=torch.float32)
+    base = np.array([min(max(0.0, low), high) for low, high in clips])
+    # each action moves up, or down where its base is its upper limit
+    change = np.array([min(0.5, high - at) or low - at for at, (low, high) in zip(base, clips, strict=True)])
+    given = torch.tensor(base + np.vstack([np.zeros(len(change)), np.diag(change)]), dtype=torch.float32)
     biases = [env.memory("encoder bias")] if env._layout.biased else []
     drawn = [bias.clone() for bias in biases]
     for bias in biases:
-        bias.zero_()  # it is of world 0, not of the robot
+        bias.zero_()  # world 0 has a random encoder bias, the robot of the exported policy has none
     for actions in given:
         controls = env.controls(actions.expand(env.num_envs, -1))
         rows.append({array: values[0].double().cpu().numpy() for array, values in controls.items()})
-    for bias, own in zip(biases, drawn, strict=True):
-        bias.copy_(own)
+    for bias, before in zip(biases, drawn, strict=True):
+        bias.copy_(before)
     env.reset()
     scale, offset = [], []
     names = ("stiffness", "damping", "force_limit", "delay_steps", "action_kind", "armature")
     gains: dict[str, list] = {name: [] for name in names}
-    for label, row, at, by in zip(env.action_labels, rows[1:], start, step, strict=True):
+    for label, row, base_action, moved_by in zip(env.action_labels, rows[1:], base, change, strict=True):
         moved = [(array, i) for array in row for i in np.flatnonzero(row[array] != rows[0][array])]
         if len(moved) > 1:  # targets of a joint and of what follows it
-            starts = {int(at): joint for at, joint in zip(scene.q_start, scene.joint_labels, strict=False)}
+            starts = {int(first): joint for first, joint in zip(scene.q_start, scene.joint_labels, strict=False)}
             moved = [one for one in moved if one[0] == "target_q" and starts.get(int(one[1])) == label] or moved
         if len(moved) != 1:
             raise ValueError(
@@ -91,8 +96,8 @@ def controls_of(env: Env) -> tuple[np.ndarray, np.ndarray, dict[str, list]]:
                 "range of actions, if clip= gives one"
             )
         ((array, i),) = moved
-        scale.append((row[array][i] - rows[0][array][i]) / by)
-        offset.append(rows[0][array][i] - scale[-1] * at)
+        scale.append((row[array][i] - rows[0][array][i]) / moved_by)
+        offset.append(rows[0][array][i] - scale[-1] * base_action)
         if array == "ctrl":
             law, delay = scene.values["actuator_bias"][0, i], scene.values["actuator_delay"][0, i]
             stiffness, damping, limit = -law[1], -law[2], scene.values["actuator_force_range"][0, i, 1]

@@ -101,12 +101,13 @@ class Box:
 def cast(w: World, origin: Any, direction: Any, most: float, obstacles: Sequence[Any] = (), steps: int = 24) -> Any:
     """Return the distance from a point along a unit vector to the ground or the nearest obstacle [m], at most ``most``.
 
-    The ground is the scene's. On a height field the ray is looked at ``steps`` times, and the crossing is interpolated
-    between two looks: what is thinner than most / steps along the ray may be missed.
+    The ground is the scene's. Over a height field the ray is sampled at ``steps`` points, and the crossing is
+    interpolated between two of them: the ray may miss what is thinner than most / steps along it. From below the ground
+    the distance is 0; but from below a plane it is ``most`` if the ray does not point downwards.
 
     Args:
         w: the world. origin: (3,) [m], direction: (3,), inertial axes. most: [m]. obstacles: of this module.
-        steps: looks along a ray over a height field.
+        steps: number of points on a ray over a height field.
     """
     best: Any = most
     ground = w.scene.ground

@@ -374,7 +374,9 @@ class World:
         """Return numbers of :meth:`memory` that are drawn once, when the environment is made, and then stay.
 
         Args:
-            name, size: as :meth:`memory`. draw: function of a ``World`` that returns the numbers.
+            name, size: as :meth:`memory`.
+            draw: function of a ``World`` that returns the numbers. Terms with one name share the numbers, and the first
+                one's function draws them: a term is traced several times, with a new function each time.
         """
         self._layout.drawn.setdefault(name, draw)
         return self.memory(name, size, reset=None)

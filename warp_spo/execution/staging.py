@@ -61,12 +61,15 @@ def choose_layout(
         messages: the number of scalars that the warps of a team send each other.
         warps: the number of warps that work on 32 worlds.
         T: the scalar type.
-        staged: rows are read through shared memory if it has room for them.
+        staged: rows of arguments are read through shared memory if they fit into it.
         gathered: short results are written through shared memory even if rows are not read through it.
         tiled: the result is left in tiles.
+        relays: a result that does not fit into shared memory may wait in its own rows, see ``kernels.long_results``.
         room: the bytes of shared memory that a block may have.
-        relays: a result without room in shared memory may wait in its own rows, see ``kernels.long_results``.
         wide: there is room for long results as they are, without a table of their distinct values.
+
+    Returns:
+        The first layout that fits into ``room``; if none does, the last one.
     """
     used = read_entries(everything)
     rows = [
@@ -79,7 +82,7 @@ def choose_layout(
     slots = count_slots(stores)
     fields = {name: tuple(sorted(used[name])) for name in FIELDS if name in used}
     cached = ((), tuple(fields.values())) if fields and warps == 1 else ((),)
-    ways = [(False, ResultLayout(DIRECT, out))]
+    ways = [(False, ResultLayout(DIRECT, out))]  # whether rows are staged, and how the result leaves; best ones first
     staged = staged or any(row.name in ("x", "body_f") and row.entries > SHORT_ROW for row in rows)
     if dense and (staged or gathered or out.entries > SHORT_ROW):
         ways = [(staged, ResultLayout(STAGED, out)), (False, ResultLayout(STAGED, out)), *ways]
@@ -98,7 +101,7 @@ def choose_layout(
     layouts = [
         KernelLayout(
             rows=rows,
-            staged=staged,
+            staged=rows_staged,
             fields=list(fields),
             result=result,
             messages=messages,
@@ -110,7 +113,7 @@ def choose_layout(
             numbers=numbers,
             repeats=SUBSTEPS in shapes,
         )
-        for staged, result in ways
+        for rows_staged, result in ways
         for together in ((True, False) if other_results and result.way in (IN_PLACE, STAGED) else (False,))
         for entries in cached[::-1]
     ]

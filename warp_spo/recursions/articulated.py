@@ -302,7 +302,13 @@ def expand_link(
     motion: VelocityTerms,
     acceleration: tuple[Vector, Vector],
 ) -> tuple[list[Value], tuple[Vector, Vector]]:
-    """Return qdd of the link's dofs and its acceleration, for D^-1 eps and the ``acceleration`` of its parent."""
+    """Return qdd of the link's dofs, and the link's acceleration (omega'; v') in its own axes.
+
+    Args:
+        rates: D^-1 eps of each pivot, as :func:`reduce_link` returns them.
+        motion: velocity terms of the link.
+        acceleration: of the parent, in the parent's axes; of a root, of the inertial frame.
+    """
     if done.in_hinge is not None:
         return _expand_root(link, place, done.in_hinge, rates, motion, acceleration)
     w, v = carry_acceleration(place, motion, acceleration)
@@ -325,7 +331,7 @@ def expand_link(
 
 
 def _reduce_root(place: LinkPlacement, pivots: list[Pivot], force: Vector, tau: Any) -> list[Value]:
-    """Return D^-1 eps of each pivot of a root with pivots in its hinge's axes, which leaves nothing for a parent."""
+    """Return D^-1 eps of each pivot of a root link whose pivots are in its hinge's axes; a root transmits no force."""
     pose, eps = Pose(None, place.turned, ZERO), []
     z = Vector((*pose.to_parent(force[:3]), *pose.to_parent(force[3:])))
     for pivot, b in zip(pivots, reversed(list(tau)), strict=True):
@@ -342,12 +348,21 @@ def _expand_root(
     motion: VelocityTerms,
     base: tuple[Vector, Vector],
 ) -> tuple[list[Value], tuple[Vector, Vector]]:
-    """Return the same for a root with pivots in its hinge's axes; ``base`` is the inertial frame's acceleration."""
+    """Return qdd of a root link's dofs and its acceleration, as :func:`expand_link`, for pivots in the hinge's axes.
+
+    The acceleration is taken to the hinge's axes, where the columns of the pivots are unit vectors, and the result is
+    turned back to the link's axes.
+
+    Args:
+        pivots: in the hinge's axes. rates: D^-1 eps of each.
+        base: acceleration of the inertial frame; -gravity stands for the weight of all links.
+    """
     pose = Pose(None, place.turned, ZERO)
-    alpha, to_hinge = [], IDENTITY if link.matrix is None else link.matrix.T
+    alpha: list[Value] = []  # (omega'; v') in the hinge's axes
+    to_hinge = IDENTITY if link.matrix is None else link.matrix.T
     w, v = base[0], base[1] + cross(base[0], place.pose.l) + motion.bias_l
-    for moved, bias in ((w, motion.bias_w), (v, motion.bias_v)):
-        alpha += to_hinge @ moved + pose.to_parent(bias)
+    for carried, bias in ((w, motion.bias_w), (v, motion.bias_v)):
+        alpha += to_hinge @ carried + pose.to_parent(bias)
     qdd = []
     for pivot, rate in zip(pivots[::-1], rates[::-1], strict=True):
         one, alpha = expand_pivot(pivot, alpha, rate)

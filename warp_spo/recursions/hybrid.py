@@ -32,6 +32,7 @@ class Given(NamedTuple):
 
     @property
     def free(self) -> bool:
+        """Whether the mask is constant and prescribes no dof of the link."""
         return all(is_constant(m) and not m for m in self.mask)
 
 
@@ -121,10 +122,13 @@ class HybridSweeps:
         mask: constant mask by dof; None: the array "prescribed" is the mask.
 
     Attributes:
-        given: of each link, by its id, as all that follows. done: factors. rates: D^-1 (tau - H z), or qdd.
-            forces_at_rest: H z.
+        given: prescribed qdd, tau and mask of each link's dofs. All attributes but ``shared`` are by id of the link.
+        done: factors.
+        rates: D^-1 (tau - H z) of each pivot, or the prescribed qdd.
+        forces_at_rest: H z of each pivot: the force on the dof at zero acceleration, velocity terms included.
         inner, forces: P+ and z+ in the parent's frame.
-        waiting: z of the links of groups. shared: qdd of groups, by dof.
+        waiting: z of links that share dofs, until the last of them eliminates these dofs.
+        shared: qdd of dofs that links share, by dof.
     """
 
     def __init__(self, trace: Trace, mask: tuple[bool, ...] | None):
@@ -141,12 +145,16 @@ class HybridSweeps:
         self.shared: dict[int, Value] = {}
 
     def reduce(self, link: Link) -> None:
-        """Eliminate a link whose children are eliminated: P, D and z."""
+        """Eliminate the dofs of a link, after those of its children: keep its factor, P+, z+ and the rates.
+
+        If no dof of the link is prescribed, this is the step of the articulated-body algorithm. A prescribed dof leaves
+        P as it is and adds P H* qdd to z. Links that share dofs wait until the last of them eliminates these dofs.
+        """
         trace, key = self.trace, id(link)
         trace.label(link, "P")
         place, move = trace.places[key], trace.motions[key]
-        carried = [self.inner[id(child)] for child in link.children]
-        through = [inside(trace, child, self.done) for child in link.children]
+        carried = [self.inner[id(child)] for child in link.children]  # P+ of the children, in the link's frame
+        through = [inside(trace, child, self.done) for child in link.children]  # poses and P+ in the children's frames
         self.given[key] = known = Given(*([entry(dof) for dof in link.dofs] for entry in self.entries))
         if link.shared_dofs is not None:
             self._wait(link, total_inertia(link, carried))
@@ -171,7 +179,7 @@ class HybridSweeps:
         return z
 
     def _wait(self, link: Link, P: Articulated) -> None:
-        """Keep what a link of a group brings; the one that closes the group eliminates it."""
+        """Keep P and z of a link that shares dofs; the last of these links eliminates the dofs."""
         trace, key = self.trace, id(link)
         self.inner[key], self.forces[key] = NO_INERTIA, NO_FORCE
         self.done[key] = articulated.LinkFactor([], P, NO_INERTIA, False, False, 0.0)

@@ -264,6 +264,11 @@ class Operators:
         return z
 
     def _gain_transposed(self, node: int, v: Vector) -> Vector:
+        """Return G* v, by dof of the node's hinge, for a motion v = (omega; v) in the node's frame.
+
+        The motion is first taken inward to the frame of the hinge's first link; from there outward, each link's pivots
+        take their share.
+        """
         self._at(node, "g")
         inner, rates = self._inner(node), []
         for _, pose, first in inner:
@@ -311,7 +316,7 @@ class Operators:
         return rates, z
 
     def _release(self, link: Link, v: Vector, given: list[Value] | None = None) -> tuple[list[Value], Vector]:
-        """The adjoint of :meth:`_eliminate`: G* v less what is ``given``, by dof, and v - H* of that."""
+        """Return rates = G* v - ``given`` by dof, and v - H* rates: the adjoint of :meth:`_eliminate`."""
         done, place, rates = self.factor(link), self.place(link), []
         self._at(link.node, "v")
         given = [0.0] * len(done.pivots) if given is None else given
@@ -378,7 +383,10 @@ class Operators:
         return self._hops[node]
 
     def _inner(self, node: int) -> list[tuple[Link | None, Pose, bool]]:
-        """The hops from the node in, and whether it is the last, to the parent; none where the hinge is fixed."""
+        """Return the hops from the node inward, and whether each is that of the hinge's first link, to the parent.
+
+        The list is empty where the hinge is fixed.
+        """
         if not self.chains[node]:
             return []
         return [(link, pose, link is self.chains[node][0]) for link, pose in reversed(self.hops(node))]

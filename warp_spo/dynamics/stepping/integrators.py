@@ -140,7 +140,7 @@ def arrays_of_bodies(dyn: Dynamics, states: dict[str, Any]) -> tuple[wp.array, w
 
 
 def write_bodies(dyn: Dynamics, q: wp.array, qd: wp.array, bodies: tuple[wp.array, wp.array]) -> None:
-    """Launch the poses and velocities of the bodies at a state."""
+    """Compute the poses and the velocities of the bodies at a state into the two arrays ``bodies``."""
     more = {"velocities_out": bodies[1]}
     if _walks(dyn) and dyn._engine.has_program(BODIES_BY_KINEMATICS, bodies[0], more, q=q, qd=qd):
         dyn._engine.launch_routine(BODIES_BY_KINEMATICS, bodies[0], more, q=q, qd=qd)
@@ -149,7 +149,10 @@ def write_bodies(dyn: Dynamics, q: wp.array, qd: wp.array, bodies: tuple[wp.arra
 
 
 def _walks(dyn: Dynamics) -> bool:
-    """Whether a kernel of its own walks to the bodies after a step: whatever the number of worlds, for equal bits."""
+    """Return whether the kernel of segments computes the states of bodies after a step.
+
+    The number of worlds does not matter here, so that results have equal bits for any number.
+    """
     return dyn.plan.of(STEP) == "segment" and dyn.programs.builder.supports_body_kinematics
 
 

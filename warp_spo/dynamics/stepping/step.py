@@ -74,7 +74,10 @@ def _pull_step(
 def _launch_gradients(
     dyn: Dynamics, derivative: Derivative, out: wp.array, more: dict[str, wp.array], **given: Any
 ) -> None:
-    """Launch gradients of a step; that of an open tree without contacts does not read tau."""
+    """Launch the gradients of a step into ``out`` and ``more``.
+
+    Without contacts and embedded loops, tau is left out: that gradient reads qdd of the step instead.
+    """
     if dyn.scene.contacts:
         contact_gradients.launch(dyn, out, more, **given)
         return
@@ -290,33 +293,39 @@ def _launch(
     given: dict[str, Any],
     buffers: tuple[wp.array, wp.array] | None,
 ) -> None:
-    """Launch ``count`` steps, each on the state after the one before: one kernel, where it can take them all.
+    """Launch ``count`` substeps, each from the state after the one before.
+
+    One kernel does all substeps where :func:`.integrators.several_launches` finds no obstacle. Otherwise each substep
+    has launches of its own, from the second on in place on q_out and qd_out. Then this function forms the mean contact
+    force and the worst status of the substeps, which are what a step reports.
 
     Args:
-        given: forces, targets, controls, and arrays to fill, by name. buffers: of delayed controls; None: no delays.
+        interval: the arrays of the state before and after, and the length of a substep.
+        given: forces, targets, controls, and arrays to fill, by name; this function changes the dictionary.
+        buffers: of delayed controls; None: no delays.
     """
     ctrl, status, bodies = given.pop("ctrl"), given.get("status"), given.pop("bodies")
-    last = {"bodies": bodies} if integrator == "semi_implicit" else {}  # of the last substep; others leave them out
-    several = integrators.several_launches(dyn, integrator, ctrl is not None, buffers is not None, given.get("passes"))
-    if 1 < count <= MOST_FUSED and not several:
-        ctrl = ctrl if dyn.scene.actuators else None
-        INTEGRATORS[integrator](dyn, call, interval, **given, **last, ctrl=ctrl, substeps=count)
+    # Only the semi-implicit integrator fills the states of bodies itself, in the last substep.
+    of_last = {"bodies": bodies} if integrator == "semi_implicit" else {}
+    obstacle = integrators.several_launches(dyn, integrator, ctrl is not None, buffers is not None, given.get("passes"))
+    ctrl = ctrl if dyn.scene.actuators else None
+    if 1 < count <= MOST_FUSED and not obstacle:
+        INTEGRATORS[integrator](dyn, call, interval, **given, **of_last, ctrl=ctrl, substeps=count)
         return
     force = given.get("reports", {}).get("contact_f") if count > 1 else None
     if force is not None:
         given["reports"]["contact_f"] = dyn.recursions.array("contact force", *force.shape)
-    ctrl = ctrl if dyn.scene.actuators else None
     for substep in range(count):
         now = ctrl if ctrl is None or buffers is None else actuators.delayed(dyn, ctrl, buffers)
         if substep and status is not None:
             given["status"] = dyn._later_status
-        INTEGRATORS[integrator](dyn, call, interval, **given, **(last if substep == count - 1 else {}), ctrl=now)
+        INTEGRATORS[integrator](dyn, call, interval, **given, **(of_last if substep == count - 1 else {}), ctrl=now)
         if force is not None:
             contact_options.add_share(dyn, substep, count, given["reports"]["contact_f"], force)
         if substep and status is not None:
             dyn.recursions.launch(combination.worst, dyn.worlds, [SEVERITY, dyn._later_status], [status])
         interval = interval._replace(q=interval.q_out, qd=interval.qd_out)
-    if bodies is not None and not last:
+    if bodies is not None and not of_last:
         integrators.write_bodies(dyn, interval.q_out, interval.qd_out, bodies)
 
 

@@ -347,7 +347,7 @@ class Tracing:
         self._clear(self.judge, self.done)
 
     def _clear(self, w: World, done: Condition) -> None:
-        """Store what a stage keeps; where ``done`` holds, the values at a reset of what has one."""
+        """Store the memory that a stage keeps; where ``done`` holds, memory with a reset value takes that value."""
         every = list(self.layout.memory.items())
         names = [name for name, (_, _, reset) in every if reset is not None]
         olds = [w.memory(name, size, reset) for name, (_, size, reset) in every if reset is not None]
@@ -365,9 +365,11 @@ class Tracing:
 
     # -- reset on request ------------------------------------------------------------------------------------------
     def _reset(self) -> None:
+        """Trace the stage "reset": the chosen worlds start anew, with episode length 0 and memory as after a reset."""
         stage = self.stages["reset"]
         chosen = Condition(stage.graph.input("chosen", 0))
-        stage.ticks = f"{CHOSEN_WORLD} ? 2u : 0u"  # of its own, and of the look that follows
+        # Two steps of random numbers: one for this stage, one for the observations that follow and count none.
+        stage.ticks = f"{CHOSEN_WORLD} ? 2u : 0u"
         w = World(self.layout, stage)
         self._start(w, chosen, intervals=False)
         stage.store("episode_length", 0, as_value(where(chosen, 0.0, w.read("episode_length", 1)[0])))
@@ -384,7 +386,11 @@ def choose(due: Condition, news: Any, olds: Any, name: str) -> Vector:
 
 
 def scalar(what: str, x: Any) -> Any:
-    """Return what a term returned, if it is one number."""
+    """Return ``x``, the result of a term, as one number; a condition becomes 1 or 0.
+
+    Raises:
+        TypeError: ``x`` is no number; the message names ``what``.
+    """
     if isinstance(x, np.ndarray) and x.size == 1:
         x = x.ravel()[0]
     if isinstance(x, Condition):

@@ -285,18 +285,26 @@ class _SegmentProgram:
         return self.builder.finish(routine, layout, cuda, cpu, tables, kernel.shared.operations, cap)
 
     def _registers(self, layout: KernelLayout) -> int:
-        """Return how many registers a thread may take, so that a multiprocessor holds as many blocks as help."""
+        """Return the largest number of registers that a thread may use; MOST_REGISTERS or more means no limit.
+
+        With many worlds in float32, the routine's hints list how many blocks a multiprocessor should hold, and how many
+        registers a thread needs then. The first entry applies that fits into the registers and the shared memory. If
+        none does, the warps of one block share all registers.
+        """
         warps = 1 if self.alone else self.schedule.warps
         if self.dtype == "float32" and not self.plan.latency_bound:
-            for blocks, enough in self.job.routine.hints.occupancy:
-                fewer = self._shared_registers(blocks * self.schedule.warps)
-                room = blocks * (layout.shared_bytes(self.run.dtype) + RESERVED) <= self.plan.device.shared_bytes
-                if fewer >= enough and room:
-                    return fewer
+            for blocks, needed in self.job.routine.hints.occupancy:
+                registers = self._shared_registers(blocks * self.schedule.warps)
+                fits = blocks * (layout.shared_bytes(self.run.dtype) + RESERVED) <= self.plan.device.shared_bytes
+                if registers >= needed and fits:
+                    return registers
         return self._shared_registers(warps)
 
     def _shared_registers(self, warps: int) -> int:
-        """Of a thread, if a multiprocessor is to hold so many warps: its parts share them, each with its registers."""
+        """Return how many registers a thread has if a multiprocessor holds so many warps, a multiple of 8.
+
+        Each of the multiprocessor's PARTS has its own registers and runs its share of the warps.
+        """
         return self.plan.device.registers // PARTS // (WARP_SIZE * -(-warps // PARTS)) // 8 * 8
 
 

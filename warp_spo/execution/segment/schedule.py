@@ -87,14 +87,15 @@ class Schedule:
 
 
 def _warps_of_leaves(leaves: list[Segment]) -> list[int]:
-    """Return the warp of each leaf: leaves of one kind share a part of the multiprocessor, which fetches its own code.
+    """Return the warp of each leaf. Leaves of one kind share a part (a sub-partition) of the multiprocessor.
 
-    Warp w runs on part w % PARTS. Up to PARTS leaves have a part each, in their order.
+    Each part fetches code for its own warps, so that leaves with equal code are to run on one part. Warp w runs on part
+    w % PARTS. If there are no more than PARTS leaves, each leaf has a part of its own, in the order of the leaves.
     """
     kinds = [_kind(segment) for segment in leaves]
     grouped = sorted(range(len(leaves)), key=lambda at: (-kinds.count(kinds[at]), kinds.index(kinds[at])))
-    places = sorted(range(len(leaves)), key=lambda warp: (warp % PARTS, warp))
-    warps = dict(zip(grouped, places, strict=True)) if len(leaves) > PARTS else dict(enumerate(range(len(leaves))))
+    by_part = sorted(range(len(leaves)), key=lambda warp: (warp % PARTS, warp))
+    warps = dict(zip(grouped, by_part, strict=True)) if len(leaves) > PARTS else dict(enumerate(range(len(leaves))))
     return [warps[at] for at in range(len(leaves))]
 
 

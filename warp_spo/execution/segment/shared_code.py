@@ -39,14 +39,18 @@ class SharedCode:
         prefix: str = "",
         loops: bool | None = None,
     ) -> str:
-        """Return the statements that warps execute in turns; equal statements share one text.
+        """Return C++ in which each warp executes its listings; listings of equal text stand there once.
+
+        With ``loops``, equal texts stand once wherever they are in the sequences. A warp with several listings of one
+        text executes them in a loop, so that it may execute its listings in another order than given. Without loops,
+        equal texts stand once if they are at the same position of the warps' sequences, and the order is as given.
+        Loops make the code shorter, and slower if the code without them fits into the instruction cache.
 
         Args:
-            warps: the warps.
-            turns: the listings of each.
+            warps: the numbers of the warps.
+            turns: the sequence of listings of each warp.
             tables: the prefix of the names of values that are read from the tables. prefix: of all other names.
-            loops: turns are loops, which are slower than statements in a row if these fit into the cache; None: where
-                they do not.
+            loops: whether to write loops. None: loops if the kernel so far has more than CACHED operations.
         """
         loops = self.operations > CACHED if loops is None else loops
         kinds: dict[str, list[tuple[int, Listing]]] = {}
@@ -56,20 +60,20 @@ class SharedCode:
                     kind = listing.text if loops else f"{at} {listing.text}"
                     kinds.setdefault(kind, []).append((warp, listing))
         text: list[str] = []
-        for at, some in enumerate(kinds.values()):
-            counts = Counter(warp for warp, _ in some)
-            mine, name = list(counts), f"{tables}{at}_"
+        for at, equal in enumerate(kinds.values()):
+            counts = Counter(warp for warp, _ in equal)
+            executing, name = list(counts), f"{tables}{at}_"
             several = max(counts.values()) > 1
-            who = f"{name}first + each" if several else choose(mine, range(len(mine)))
-            head, (body,) = self.merge([[listing for _, listing in some]], prefix, name, who)
-            condition = "" if len(mine) == len(warps) else f"if ({any_of(mine)}) "
+            who = f"{name}first + each" if several else choose(executing, range(len(executing)))
+            head, (body,) = self.merge([[listing for _, listing in equal]], prefix, name, who)
+            condition = "" if len(executing) == len(warps) else f"if ({any_of(executing)}) "
             inside = [head, body]
             if several:
                 starts = itertools.accumulate(counts.values(), initial=0)
                 inside = [
-                    f"const int {name}first = {choose(mine, starts)};",
+                    f"const int {name}first = {choose(executing, starts)};",
                     "#pragma unroll 1",
-                    f"for (int each = 0; each < {choose(mine, counts.values())}; ++each) {{",
+                    f"for (int each = 0; each < {choose(executing, counts.values())}; ++each) {{",
                     *inside,
                     "}",
                 ]

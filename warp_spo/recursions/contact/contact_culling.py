@@ -89,34 +89,38 @@ def group_points(
     states: list[PointState],
     candidates: list[Value],
 ) -> dict[int, CullGroup]:
-    """Return the groups by id of the link; none where code skips points one by one, as on a CPU those of walls.
+    """Return the groups of contact points that passes skip together, by id of their link.
 
-    A GPU skips them where segments share the work, and where aggregates couple pairs of bodies. With a thread a world
-    otherwise, the one body with so many points is often the one on the ground, and branches cost a few per cent.
+    A link has a group if it has at least CULL_AT_LEAST points and none of them has ``near``. The code skips a point
+    with ``near`` by itself where its surface is not near, as those of walls where one evaluation does the whole world.
+
+    Where segments share a world, the branches of a group are "fork": a GPU skips them, too. Where one evaluation does
+    the whole world they are "branch": a CPU skips them, and a GPU only if aggregates couple pairs of bodies. The one
+    body with so many points is often the one on the ground there, and branches cost a few per cent.
 
     Args:
-        candidates: whether the first pass closes each point.
+        candidates: for each point, whether it is a candidate of the first pass.
     """
-    on: dict[int, list[int]] = {}
+    indices_of: dict[int, list[int]] = {}  # by id of the link
     for at, point in enumerate(points):
         if point.link is not None:
-            on.setdefault(id(point.link), []).append(at)
+            indices_of.setdefault(id(point.link), []).append(at)
     found: dict[int, CullGroup] = {}
     op = "branch" if trace.exchange.alone else "fork"
-    for key, places in on.items():
-        some = [points[at] for at in places]
-        if len(some) >= CULL_AT_LEAST and all(point.near is None for point in some):
-            trace.label(some[0].link, "k")  # type: ignore[arg-type]
-            has_candidates = total(candidates[at] for at in places) + lost(
-                total(x for one in some for x in (one.push, one.mu))
+    for key, indices in indices_of.items():
+        on_link = [points[at] for at in indices]
+        if len(on_link) >= CULL_AT_LEAST and all(point.near is None for point in on_link):
+            trace.label(on_link[0].link, "k")  # type: ignore[arg-type]
+            has_candidates = total(candidates[at] for at in indices) + lost(
+                total(x for point in on_link for x in (point.push, point.mu))
             )
-            state = (
+            fields = (
                 pass_variables.variable(has_candidates),
-                maximum([one.depth for one in some]),
-                maximum([one.lever for one in some]),
+                maximum([point.depth for point in on_link]),
+                maximum([point.lever for point in on_link]),
                 op,
             )
-            found[key] = CullGroup([(points[at], states[at]) for at in places], *state)
+            found[key] = CullGroup([(points[at], states[at]) for at in indices], *fields)
     return found
 
 

@@ -52,10 +52,14 @@ class TreeEquations:
         return {item.index[0]: item.value for item in expand(self.trace, done, rates, (ZERO, ZERO))}
 
     def gradient(self, solved: dict[int, Value], qdd: Entry, tau: Entry, right: Entry) -> Gradients:
-        """Return the gradient of solved . (tau - Mass qdd - bias_force) by all that tau does not depend on.
+        """Return the gradient of solved . (tau - Mass qdd - bias_force) by all arguments but tau.
+
+        ``solved`` and tau count as constants.
 
         Args:
-            solved, right: Mass solved = ``right``. qdd, tau: at which the equations hold.
+            solved, right: by dof, Mass solved = ``right``.
+            qdd, tau: by dof, the accelerations and forces for which the equations hold. An open tree reads neither tau
+                nor ``right``; they are for closed loops.
         """
         return Power(self.trace, lambda dof: -solved[dof], qdd).gradients
 

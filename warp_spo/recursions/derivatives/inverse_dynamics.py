@@ -36,7 +36,7 @@ def inverse_dynamics_derivatives(trace: Trace, mass: bool = True) -> list[Store]
     letters = messages.needed(LETTERS, trace.inputs)
     inner: dict[str, dict[int, list[Value]]] = {letter: {} for letter in letters}  # what links hand to their parents
     drifts: dict[int, Vector] = {}
-    shared: dict[int, tuple[SensitivityAdjoint, list]] = {}  # of groups, by dof
+    shared: dict[int, tuple[SensitivityAdjoint, list]] = {}  # of dofs that links share
     stores: list[Store] = []
     for link, outward in trace.traversal():
         key, over = id(link), link.parent
@@ -115,7 +115,20 @@ def _entries(
     drifts: dict[int, Vector],
     shared: dict,
 ) -> list[Store]:
-    """Entries of the three blocks in which a dof of the link meets one of its hinge or nearer to the root."""
+    """Return the entries of the three blocks for each dof of the link, paired with the dofs of its hinge and ancestors.
+
+    For each dof of the link, the change of force that the dof makes is projected on its own hinge and carried to every
+    ancestor: these entries are the column of the dof. ``row`` is the force on the dof as a function of how the link
+    moves otherwise. It is carried along and applied to the ancestors' sensitivities: these entries are the row of the
+    dof. Mass is symmetric, so its column is stored as its row, too.
+
+    Args:
+        all_in: the sums over all that the link carries.
+        force: (n; f) that the link's hinge transmits, in the link's frame.
+        own: sensitivities to coordinates and to rates of each link's dofs, by id of the link.
+        drifts: of the links, see :func:`.sensitivity.drift`, by id.
+        shared: of each dof that links share, the sums over the links so far; this function adds to them.
+    """
     place, stores = trace.places[id(link)], []
     by_q, by_qd = own[id(link)]
     changes = link.hinge.column_changes(place)
@@ -129,7 +142,7 @@ def _entries(
         blocks = [(Q, *change), (QD, *all_in.force(s_d)), (QDD, row.w, row.v)]
         for block, n_own, f_own in blocks:
             tau = motion.hinge_entries(link, place, n_own, f_own)
-            if block == Q and changes is not None:  # columns that stay with the link, but for their own change
+            if block == Q and changes is not None:  # columns move with the link, so no turn; they change with q
                 tau = [
                     a + _power(c, force)
                     for a, c in zip(motion.hinge_entries(link, place, n, f), changes[at], strict=True)
@@ -137,24 +150,28 @@ def _entries(
             for i, value in zip(link.dofs, tau, strict=True):
                 extra = link.armature[at] if block == QDD and i == dof else 0.0
                 stores.append(Store("out", (block, i, dof), value + extra))
-        blocks[0] = Q, change[0] + cross(s.shift, force[1]), change[1]  # the parent feels the force elsewhere
-        over = link
-        while over.parent is not None:
-            pose = trace.places[id(over)].pose
-            row = row.to_parent(trace.places[id(over)], drifts[id(over)])
+        # the dof shifts the link's origin in the parent, and with it the line of the force
+        blocks[0] = Q, change[0] + cross(s.shift, force[1]), change[1]
+        outer = link
+        while outer.parent is not None:
+            pose = trace.places[id(outer)].pose
+            row = row.to_parent(trace.places[id(outer)], drifts[id(outer)])
             blocks = [*((block, *pose.force_to_parent(n, f)) for block, n, f in blocks[:2]), (QDD, row.w, row.v)]
-            if over is link and link.shared_dofs is not None:  # links of a group go on together from the last one
+            if outer is link and link.shared_dofs is not None:  # links that share dofs: the last carries on their sum
                 row, blocks = shared[dof] = _sum_of_links(shared[dof], row, blocks) if dof in shared else (row, blocks)
                 if not link.is_last:
                     break
-            over = over.parent
-            for block, n, f in blocks:
-                for i, value in zip(over.dofs, motion.hinge_entries(over, trace.places[id(over)], n, f), strict=True):
+            outer = outer.parent
+            place_outer = trace.places[id(outer)]
+            for block, n_outer, f_outer in blocks:
+                for i, value in zip(
+                    outer.dofs, motion.hinge_entries(outer, place_outer, n_outer, f_outer), strict=True
+                ):
                     stores.append(Store("out", (block, i, dof), value))
                     if block == QDD:
                         stores.append(Store("out", (block, dof, i), value))
-            for block, sensitivities in ((Q, own[id(over)][0]), (QD, own[id(over)][1])):
-                for j, other in zip(over.dofs, sensitivities, strict=True):
+            for block, sensitivities in ((Q, own[id(outer)][0]), (QD, own[id(outer)][1])):
+                for j, other in zip(outer.dofs, sensitivities, strict=True):
                     stores.append(Store("out", (block, dof, j), row.at(other)))
     return stores
 

@@ -162,7 +162,7 @@ def of_coordinates(
     rates: Any,
     qdd: Any,
 ) -> list[Sensitivity]:
-    """Per unit displacement along each dof of a link.
+    """Return the sensitivity of all that a link carries to each coordinate of the link, per unit displacement.
 
     A screw's own velocity is constant in the link; that of a ball or free hinge is constant in its parent. Columns that
     depend on q add how they change.
@@ -206,7 +206,15 @@ def _entries_of(link: Link, entry: Any) -> list[Value]:
 def of_rates(
     link: Link, place: LinkPlacement, motion: VelocityTerms, parent: VelocityTerms, rates: Any
 ) -> list[Sensitivity]:
-    """Per unit of each rate of a link; ``rates``: qd by dof, or None."""
+    """Return the sensitivity of all that a link carries to each rate of the link, per unit of the rate.
+
+    A rate along the column (w; v) of H* moves nothing at once. It adds the spin w and, by products of velocities, the
+    acceleration (omega_parent + omega) x w, which includes the term omega x w of :attr:`Sensitivity.w`, and
+    2 omega_parent x v. If H* depends on q, the hinge's own bias acceleration changes with the rate, too.
+
+    Args:
+        motion, parent: velocities of the link and of its parent. rates: qd by dof; None if velocities are zero.
+    """
     spin_c = place.pose.to_child(parent.spin)
     both = spin_c + motion.spin
     found = [Sensitivity(ZERO, ZERO, w, cross(both, w), cross(spin_c, v) * 2.0) for w, v in columns(link, place)]

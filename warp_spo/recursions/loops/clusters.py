@@ -111,7 +111,7 @@ class ClusterConstraints:
 def independent_rows(
     cluster: Cluster, places: dict[int, LinkPlacement], kept: Any, epsilon: float, held: frozenset[int] = frozenset()
 ) -> ClusterConstraints:
-    """Return a cluster with the rows ``pass_variables``, by number in the scene; dofs in ``held`` do not move."""
+    """Return a cluster with the rows ``kept``, by number in the scene; dofs in ``held`` do not move."""
     rows = [row for _, constraint in cluster.constraints for row in constraint.jacobian(places)]
     sizes = [size for _, constraint in cluster.constraints for size in constraint.sizes(places)]
     numbers = [i for i, number in enumerate(cluster.rows) if number in kept]

@@ -38,7 +38,8 @@ class ClosedEquations(TreeEquations):
     """The equations that accelerations solve where loops are embedded.
 
     Attributes:
-        loops: the closed loops. fixed: dofs that the closures do not move.
+        loops: the closed loops.
+        fixed: dofs that the closures do not move: the multipliers are solved with the columns of Y of the others alone.
     """
 
     def __init__(self, trace: Trace, embedding: Embedding, fixed: tuple[int, ...] = ()):
@@ -94,16 +95,21 @@ def forward_dynamics_vjp(trace: Trace, embedding: Embedding, wrt: tuple[str, ...
 
 
 def inverse_dynamics_vjp(trace: Trace, embedding: Embedding, wrt: tuple[str, ...]) -> list[Store]:
-    """J* cotangent [independent dof] of inverse dynamics: lambda = -X cotangent, closures leaving independent dofs"""
+    """J* cotangent of inverse dynamics in the independent dofs, for the arguments ``wrt``
+
+    The function is X* (Mass qdd + bias_force) [independent dof], at the qdd = X qdd_independent + k that the closures
+    allow. Its adjoint has the form of forward dynamics' one, with lambda = -X cotangent and multipliers from the
+    columns of Y of the dependent dofs alone, see the file's docstring.
+    """
     equations, y = ClosedEquations(trace, embedding, embedding.dofs), trace.vector("cotangent")
     place_links(trace, "qd" in trace.inputs)
-    solved = dict.fromkeys(range(trace.links.scene.dof_count), 0.0)
+    weights = dict.fromkeys(range(trace.links.scene.dof_count), 0.0)  # lambda
     qdd = accelerations(equations.loops)
-    for free, column in columns_of_all(equations.loops).items():
+    for independent, column in columns_of_all(equations.loops).items():
         for dof, x in column.items():
-            solved[dof] = solved[dof] - x * y(embedding.dofs.index(free))
-    found = equations.gradient(solved, qdd.__getitem__, lambda dof: 0.0, lambda dof: 0.0)
-    found |= {("qdd", dof): 0.0 for dof in qdd if dof not in embedding.dofs}
+            weights[dof] = weights[dof] - x * y(embedding.dofs.index(independent))
+    found = equations.gradient(weights, qdd.__getitem__, lambda dof: 0.0, lambda dof: 0.0)
+    found |= {("qdd", dof): 0.0 for dof in qdd if dof not in embedding.dofs}  # qdd of dependent dofs is not read
     return gradient_stores(trace, found, wrt, wrt)
 
 

@@ -224,10 +224,11 @@ def _products(loops: ClosedLoops, swept: Swept, columns: dict[int, dict[int, lis
 
 
 def hybrid_dynamics(trace: Trace, embedding: Embedding, mask: tuple[bool, ...]) -> list[Store]:
-    """out = qdd, tau_out = tau: independent dofs under the ``mask`` follow qdd, the others tau
+    """out = qdd, tau_out = tau of all dofs: independent dofs under the ``mask`` follow qdd, the other ones follow tau
 
-    Columns of X under the mask are not eliminated, k + X qdd[mask] is what the velocities demand; a link outside
-    clusters with a dof under the mask becomes a cluster by itself.
+    The columns of X of prescribed dofs are left out of the elimination, and X qdd of these dofs is added to k, the
+    accelerations that do not depend on the free dofs. A link outside clusters with a prescribed dof becomes a cluster
+    by itself. tau_out of a prescribed dof is the force that it needs while tau acts on all other dofs.
     """
     moves, tau, given = "qd" in trace.inputs, trace.vector("tau"), trace.vector("qdd")
     alone = [link for link in trace.links.links if any(mask[dof] for dof in link.dofs)]
@@ -251,7 +252,7 @@ def hybrid_dynamics(trace: Trace, embedding: Embedding, mask: tuple[bool, ...]) 
     for dof, value in qdd.items():
         stores.append(Store("out", (dof,), value))
         needed = tau(dof)
-        if mask[dof]:  # whatever acts on the dependent dofs
+        if mask[dof]:  # X* force of its column, less the part that tau on the dependent dofs provides
             needed = force[dof] + total(x * (force[i] - tau(i)) for i, x in X[dof].items() if i != dof)
         stores.append(Store("tau_out", (dof,), needed))
     return stores

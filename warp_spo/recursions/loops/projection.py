@@ -50,7 +50,10 @@ def project_position(trace: Trace, embedding: Embedding, fixed: tuple[int, ...] 
 
 
 def move_all(trace: Trace, step: Columns) -> list[Store]:
-    """out [coordinate] = q after a small step"""
+    """out [coordinate] = q after a small step by dof; dofs that ``step`` leaves out do not move
+
+    The links have to be placed before, see :func:`place_links`.
+    """
     stores = []
     for link in trace.links.leaders:
         trace.label(link, "q")

@@ -221,9 +221,11 @@ class Links:
         )
 
     def _without_rounding(self, node: int, own: Rigid) -> Rigid:
-        """Return the inertia of a body about its CoM without moments that are zero but for rounding.
+        """Return ``own``, the inertia of a body about its CoM, with zeros for moments that are only rounding.
 
-        They are the difference of moments about another point, and a pivot that should be zero would be positive.
+        ``own`` was computed as a difference of moments about another point, which leaves rounding. With it, the pivot
+        of a dof without inertia would be a small positive number instead of zero, and nothing would report it. Which
+        moments are zero is read from the scene's inertia; if that is variable, ``own`` is returned as it is.
         """
         inertia, R = self.values["body_inertia"][node], self.poses["joint_X_c"][self.scene.hinge_of[node]][0]
         if inertia.dtype == object or R.dtype == object:

@@ -80,24 +80,26 @@ class SharedConstants:
 
 
 def find_differing(segments: list[Segment], constants: list[SharedConstants], texts: list[Any]) -> list[frozenset]:
-    """Return for each segment the keys of the constants that shall not fold; none where texts are equal already.
+    """Return for each segment the keys of the constants that its code must read from a table instead of folding.
 
-    Segments have equal structure if they move on the same segment and have the same hinges and keys.
+    Among segments of equal structure these are the constants whose values differ, so that the segments can share one
+    code. There are none if the segments' codes are equal with folded constants already. Segments have equal structure
+    if they have the same parent segment, equally many children, the same hinges, and the same keys.
 
     Args:
-        texts: what is equal for segments that share their code.
+        texts: for each segment, a value that is equal for two segments if their codes are equal.
     """
-    made: dict[tuple, list[int]] = {}
+    groups: dict[tuple, list[int]] = {}  # indices of segments, by structure
     for at, (segment, own) in enumerate(zip(segments, constants, strict=True)):
         hinges = tuple(link.hinge.shape for link in segment.links)
         above = -1 if segment.parent is None else segment.parent.index
-        made.setdefault((above, len(segment.children), hinges, frozenset(own.by_key)), []).append(at)
+        groups.setdefault((above, len(segment.children), hinges, frozenset(own.by_key)), []).append(at)
     found = [frozenset[tuple]() for _ in segments]
-    for equal in made.values():
-        if len({texts[at] for at in equal}) == 1:
+    for group in groups.values():
+        if len({texts[at] for at in group}) == 1:
             continue
-        keys = constants[equal[0]].by_key
-        unfolded = frozenset(key for key in keys if len({constants[at].by_key[key] for at in equal}) > 1)
-        for at in equal:
+        keys = constants[group[0]].by_key
+        unfolded = frozenset(key for key in keys if len({constants[at].by_key[key] for at in group}) > 1)
+        for at in group:
             found[at] = unfolded
     return found

@@ -43,7 +43,11 @@ def passive_force(trace: Trace) -> list[Store]:
 
 
 def compensation(trace: Trace) -> dict[int, Value]:
-    """Return the forces of the hinges that -gravcomp mass gravity at the bodies' CoMs amounts to, by dof."""
+    """Return the generalized forces of gravity compensation, by dof; empty if no body has ``gravcomp``.
+
+    On each body, a force -gravcomp mass gravity acts at its CoM. The result is the sum over the bodies of J* force,
+    with the Jacobian J of the CoM. An inward sweep collects it: each link adds its children's wrenches to its own.
+    """
     found: dict[int, Value] = {}
     if not trace.compensate_gravity():
         return found
@@ -58,7 +62,7 @@ def compensation(trace: Trace) -> dict[int, Value]:
             wrench = wrench + forces[id(child)]
         n, f = Vector(wrench[:3]), Vector(wrench[3:])
         for dof, force in zip(link.dofs, hinge_entries(link, place, n, f), strict=True):
-            found[dof] = found.get(dof, 0.0) + force
+            found[dof] = found.get(dof, 0.0) + force  # several links may share a dof
         n, f = place.pose.force_to_parent(n, f)
         forces[id(link)] = Vector((*n, *f))
     return found

@@ -37,7 +37,9 @@ NOISE = 4.0  # roundings of a law's terms; two pieces may differ by so much wher
 class Law(NamedTuple):
     """f(u) = scale * clip(force - resistance u, least, most); None is no bound.
 
-    ``scale`` is zero or more and does not influence which piece is active, so that derivatives by it exist at zero.
+    ``scale`` is zero or more and does not influence which piece is active, so that derivatives by it exist at zero. A
+    law without bounds has scale 1: its force and resistance contain the factor already.
+
     ``role`` is LIMIT or FRICTION where a step with contacts treats a law in its own way; ``depth`` is how far outside a
     limit q is, and ``stiffness`` its spring. ``symmetric``: the bounds are opposite numbers.
     """
@@ -94,7 +96,11 @@ class Law(NamedTuple):
         return less(NOISE * epsilon * size, absolute(one.at(u) - piece.line(u)))
 
     def active_resistance(self, u: Value, epsilon: float) -> Value:
-        """Return the resistance at ``u``; within rounding of a bound, that of the unbounded piece."""
+        """Return -df/du at ``u``: scale * resistance between the bounds, and zero where a bound cuts the force.
+
+        If the force at ``u`` differs from a bound by no more than rounding, it counts as between the bounds. A dof
+        without mass is solved from its laws alone, so that its force may lie on a bound up to rounding.
+        """
         if not self.has_bounds:
             return self.resistance
         line, size = self.line(u), absolute(self.force) + absolute(self.resistance * u)
