@@ -243,3 +243,10 @@ def test_loops_that_move_no_inertia_are_lost(device):
     assert np.isnan(qdd[1]).all() and np.isfinite(qdd[[0, 2]]).all()
     X = Closed(scene, q[2]).columns(dyn.independent_dofs)[:, 0]
     np.testing.assert_allclose(qdd[2, 0], X.sum() / 0.1, rtol=1e-9)
+
+
+def test_samples_stay_within_limits_far_from_zero():
+    """Of a slider between 4 and 5 m, which no sample within 3.2 m of zero reaches."""
+    hinge = spo.Hinge("prismatic", -1, 0, axis=(1, 0, 0), limit_lower=4.0, limit_upper=5.0)
+    q = drawn(spo.Scene([spo.Body(1.0, inertia=np.eye(3))], [hinge]), 64)
+    assert (q[1::2] >= 4.0).all() and (q[1::2] <= 5.0).all()  # every other one is shrunk towards the neutral q

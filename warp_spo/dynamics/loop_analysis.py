@@ -97,10 +97,10 @@ class ClosureEvaluator:
 def drawn(scene: Scene, count: int, seed: int = 0) -> np.ndarray:
     """Return random samples of the configuration [sample, coordinate], the same for equal arguments.
 
-    Coordinates are uniform within their limits, no further than 3.2 from zero, or in (-1.5, 1.5) where a limit is
-    missing [rad, m]. Quaternions are uniform over all rotations; the other coordinates of their hinges stay neutral.
-    Every other sample is then shrunk to a tenth of its distance from the neutral configuration, in which robots are
-    usually modelled. Shrunk quaternions are not normalised.
+    Coordinates are uniform within their limits, no further than 3.2 from zero where the limits allow it, or in
+    (-1.5, 1.5) where a limit is missing [rad, m]. Quaternions are uniform over all rotations; the other coordinates of
+    their hinges stay neutral. Every other sample is then shrunk to a tenth of its distance from the neutral
+    configuration, in which robots are usually modelled. Shrunk quaternions are not normalised.
     """
     rng = np.random.default_rng(seed)
     q = np.tile(scene.neutral_q, (count, 1))
@@ -114,7 +114,8 @@ def drawn(scene: Scene, count: int, seed: int = 0) -> np.ndarray:
         for i in range(hinge.dof_count):
             bounded = lower[dof + i] > -UNLIMITED and upper[dof + i] < UNLIMITED and lower[dof + i] < upper[dof + i]
             low, high = (lower[dof + i], upper[dof + i]) if bounded else (-1.5, 1.5)
-            q[:, coordinate + i] = rng.uniform(max(low, -3.2), min(high, 3.2), count)
+            near = max(low, -3.2), min(high, 3.2)
+            q[:, coordinate + i] = rng.uniform(*(near if near[0] <= near[1] else (low, high)), count)
     near_neutral = q[::2]
     q[::2] = scene.neutral_q + 0.1 * (near_neutral - scene.neutral_q)
     return q

@@ -9,6 +9,8 @@ from xml.parsers import expat
 
 import numpy as np
 
+from ...errors import shown
+
 
 class XmlElement(ET.Element):
     """An XML element with its file and line. Its methods raise ValueError that names both.
@@ -23,14 +25,15 @@ class XmlElement(ET.Element):
 
     def error(self, what: str) -> ValueError:
         """Return an error about the element; ``what`` says what came, what was expected and what to do."""
-        name = f" name={self.get('name')!r}" if self.get("name") else ""
+        name = f" name='{shown(self.get('name', ''))}'" if self.get("name") else ""
         return ValueError(f"load: {str(self.file)!r}, line {self.line}, <{self.tag}{name}>: {what}")
 
     def child(self, tag: str) -> XmlElement | None:
         """Return the only child of that tag, or None if there is none."""
         found: list[Any] = self.findall(tag)
         if len(found) > 1:
-            raise found[1].error(f"a second one in <{self.tag}> {self.get('name', '')!r}; expected one; remove it")
+            name = shown(self.get("name", ""))
+            raise found[1].error(f"a second one in <{self.tag}> '{name}'; expected one; remove it")
         return found[0] if found else None
 
     def needed(self, name: str) -> str:
@@ -61,7 +64,7 @@ class XmlElement(ET.Element):
             values = np.array([np.nan])
         wrong = np.isnan(values) if infinite else ~np.isfinite(values)
         if len(values) != count or wrong.any() or "_" in text:  # Python reads 1_000
-            raise self.error(f"{name} is {text!r}; expected {count} finite number{'s' * (count > 1)}")
+            raise self.error(f"{name} is '{shown(text)}'; expected {count} finite number{'s' * (count > 1)}")
         return values
 
 
