@@ -35,7 +35,7 @@ REFUSED = {
     "an external entity": robot('<link name="&secret;"/>', head=OUTSIDE),
     "a cycle of joints": robot(link("a"), link("b"), joint("a", "b"), joint("b", "a")),
     "a joint of a link with itself": robot(link("a"), joint("a", "a")),
-    "a number of a megabyte": robot(link("a").replace('value="1"', f'value="{"9" * 1_000_000}"'), link("b"), joint("a", "b")),
+    "a number of a megabyte": robot(link("a"), link("b").replace('"1"', f'"{"9" * 1_000_000}"', 1), joint("a", "b")),
     "an infinite mass": robot(link("a"), link("b").replace('value="1"', 'value="inf"'), joint("a", "b")),
     "a torn file": robot(link("a"), link("b"), joint("a", "b"))[:-25],
     "no file at all": "\0\1\2\3" * 100,
