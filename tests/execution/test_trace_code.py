@@ -294,3 +294,16 @@ def test_pointers_into_rows_have_names_of_their_own():
     for row in ("q", "qd"):
         copy = shared_rows._copy_in(shared_rows.SharedRow(row, 2, 7), 0, "float", False)
         assert not re.search(rf"\b{row}_(from|to)\b", copy.declared + copy.one + copy.several)
+
+
+def test_a_sum_of_thousands_of_terms(device, rng):
+    """Deeper than Python's own stack: contacts of a crowded scene add up so."""
+    graph, count = g.Graph(), 3000
+    x = [graph.input("x", i) for i in range(count)]
+    total = x[0] * x[1]
+    for i in range(2, count):
+        total = total - x[i] if i % 3 else total + x[i]
+    rows = rng.normal(size=(3, count))
+    signs = np.where(np.arange(count) % 3, -1.0, 1.0)
+    found = compiled([total], rows, "float64", device, fuses=True)[:, 0]
+    np.testing.assert_allclose(found, rows[:, 0] * rows[:, 1] + (rows * signs)[:, 2:].sum(axis=1), atol=1e-11)

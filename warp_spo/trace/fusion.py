@@ -6,7 +6,7 @@ The choice depends on the formulas only, so that every kernel with the same form
 from __future__ import annotations
 
 from collections import Counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from .scalars import Scalar, Value
 
@@ -44,24 +44,31 @@ def choose_chains(
     known, inside = {x.key for x in scalars}, set()  # type: set[tuple], set[tuple]
 
     def terms_of(value: Value, sign: int) -> list[tuple[int, Scalar]] | None:
-        """Return the terms of a sum that is used once, a product without a statement first; None: it has none."""
-        if value.__class__ is not Scalar or uses[value.key] != 1 or value.key in stored or value.key in inside:
-            return None
-        if value.key not in known:
-            return None
-        if value.op == "mul":
-            return None if value.key in fused else [(sign, value)]
-        if value.op not in ("add", "sub"):
-            return None
-        a, b = value.args
-        signs = sign, -sign if value.op == "sub" else sign
-        product = taken.get(value.key)
-        for at, (inner, other) in enumerate(((a, b), (b, a))):
-            if inner is product or (product is None and other.__class__ is not Scalar):
+        """Return the terms of a sum that is used once, a product without a statement first; None: it has none.
+
+        Sums are searched depth first, with a list of what is left to try: they may have thousands of terms. The trail
+        of a value holds the terms beside it, the nearest first.
+        """
+        untried: list[tuple[Value, int, Any]] = [(value, sign, None)]
+        while untried:
+            value, sign, trail = untried.pop()
+            if value.__class__ is not Scalar or uses[value.key] != 1 or value.key in stored or value.key in inside:
                 continue
-            found = terms_of(inner, signs[at])
-            if found is not None:
-                return [*found, (signs[1 - at], other)]
+            if value.key not in known or (value.op == "mul" and value.key in fused):
+                continue
+            if value.op == "mul":
+                found = [(sign, value)]
+                while trail is not None:
+                    term, trail = trail
+                    found.append(term)
+                return found
+            if value.op in ("add", "sub"):
+                a, b = value.args
+                signs = sign, -sign if value.op == "sub" else sign
+                product = taken.get(value.key)
+                for at, inner, other in ((1, b, a), (0, a, b)):  # the last one is tried first
+                    if inner is not product and (product is not None or other.__class__ is Scalar):
+                        untried.append((inner, signs[at], ((signs[1 - at], other), trail)))
         return None
 
     chains: dict[tuple, Chain] = {}
@@ -84,10 +91,13 @@ def choose_chains(
 
 def sums_of(value: Scalar, terms: set[tuple]) -> set[tuple]:
     """Return the keys of the sums between ``value`` and its ``terms``."""
-    if value.key in terms:
-        return set()
-    inner = (each for each in value.args if each.__class__ is Scalar)
-    return {value.key}.union(*(sums_of(each, terms) for each in inner))
+    found, rest = set(), [value]
+    while rest:
+        one = rest.pop()
+        if one.key not in terms:
+            found.add(one.key)
+            rest += [each for each in one.args if each.__class__ is Scalar]
+    return found
 
 
 def choose_products(scalars: list[Scalar], stored: set[tuple]) -> tuple[dict[tuple, Scalar], set[tuple]]:
