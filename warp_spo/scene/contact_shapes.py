@@ -118,7 +118,7 @@ IN_BODY = Placement()
 
 
 class ContactShape(StoredPart):
-    """What is asked of the kinds of shapes. A kind answers what applies to it.
+    """The interface of the kinds of shapes. A kind overrides the methods that apply to it.
 
     Attributes:
         kind: its name in messages, and the argument of a Contact, if it is one of ``ARGUMENTS``.

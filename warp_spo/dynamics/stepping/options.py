@@ -1,4 +1,4 @@
-"""What a caller of ``Dynamics.step`` chooses, and the arrays that a step fills: options and reports.
+"""The options of ``Dynamics.step``, and its report: the arrays that a step fills for its caller.
 
 Both are bundles of arguments of the operation, see :class:`..operation.Bundle`: a call passes their members on by name.
 """

@@ -1,4 +1,4 @@
-"""What one evaluation works on, and how results pass between the segments of a scene.
+"""The part of a scene that one evaluation works on, and the messages by which results pass between segments.
 
 A recursion is written once. Where one evaluation takes the whole tree, :class:`WholeTree` keeps the values that
 segments pass to each other. Where it takes one segment, :class:`SegmentExchange` sends and receives them through an
@@ -21,7 +21,7 @@ from .segments import Segment, Segments
 
 
 class Exchange(abc.ABC):
-    """What an evaluation works on, and its messages.
+    """The part of a scene that one evaluation works on, and the messages that it sends and receives.
 
     Attributes:
         alone: no other evaluation takes part in the computation.

@@ -10,7 +10,7 @@ from ...trace.scalars import Value
 
 
 class StepPhases(NamedTuple):
-    """What one evaluation stores, in the order of execution. Where there are no passes, ``sweep`` runs once.
+    """The stores of one evaluation, in the order of execution. Where there are no passes, ``sweep`` runs once.
 
     Attributes:
         prologue: before the passes: variables that they read, and messages.
@@ -77,7 +77,7 @@ class PhaseBuilder:
 
     @property
     def phases(self) -> StepPhases:
-        """What has been added."""
+        """The stores that were added, by phase."""
         return self._phases
 
 
