@@ -87,7 +87,12 @@ def test_a_robot_that_is_thrown(monkeypatch, device, dtype):
 
 BUGS = {
     "turning forgotten": (contact_culling.CullGroup, "may_touch", "(v + self.reach * w)", "v"),
-    "points forgotten": (contact_culling, "group_points", "one.depth for one in some", "one.depth for one in some[:1]"),
+    "points forgotten": (
+        contact_culling,
+        "group_points",
+        "depth for point in on_link",
+        "depth for point in on_link[:1]",
+    ),
 }
 
 
