@@ -4,6 +4,8 @@ Mass (qd' - qd) / dt = tau - bias_force + f(q', qd') is the gradient of a convex
 with its own rate: sweeps over the dofs that solve each one's equation for its own rate converge to the one solution.
 """
 
+import math
+
 import numpy as np
 
 from warp_spo.reference.dense import Dense
@@ -26,21 +28,24 @@ def hinge_force(d, h, qd, target_q, target_qd):
     for hinge, q, v in zip(scene.hinges, scene.q_start, scene.qd_start, strict=False):
         if hinge.kind not in ("ball", "free"):
             position[v : v + hinge.dof_count] = d.q[q : q + hinge.dof_count]
-    heavy = HOLD / np.linalg.inv(Dense(one, scene.neutral_q).mass_matrix).diagonal() / h
+    heavy = (HOLD / np.linalg.inv(Dense(one, scene.neutral_q).mass_matrix).diagonal() / h).tolist()
+
+    names = ("stiffness", "damping", "effort_limit", "limit_ke", "limit_kd", "limit_lower", "limit_upper", "friction")
+    of_dof = list(zip(*(value(f"joint_{name}").tolist() for name in (*names, "velocity_limit")), strict=True))
+    spring, drives, ke, kd, target_qd, position = (
+        x.tolist() for x in (turn["spring"], turn["drive"], ke, kd, target_qd, position)
+    )
 
     def force(i, v):
-        f = turn["spring"][i] - value("joint_stiffness")[i] * h * v - value("joint_damping")[i] * v
-        drive = turn["drive"][i] - ke[i] * h * v + kd[i] * (target_qd[i] - v)
-        effort = value("joint_effort_limit")[i]
-        f += np.clip(drive, -effort, effort) if effort < NONE else drive
-        stiff, damp = value("joint_limit_ke")[i], value("joint_limit_kd")[i]
-        lower, upper = value("joint_limit_lower")[i], value("joint_limit_upper")[i]
-        if np.isfinite(position[i]):
+        stiffness, damping, effort, stiff, damp, lower, upper, friction, most = of_dof[i]
+        f = spring[i] - stiffness * h * v - damping * v
+        drive = drives[i] - ke[i] * h * v + kd[i] * (target_qd[i] - v)
+        f += min(max(drive, -effort), effort) if effort < NONE else drive
+        if math.isfinite(position[i]):
             q, after = position[i], position[i] + h * v
             f += max(0.0, stiff * (lower - after) - (damp * v if q < lower else 0.0)) if lower > -1e10 else 0.0
             f += min(0.0, stiff * (upper - after) - (damp * v if q > upper else 0.0)) if upper < 1e10 else 0.0
-        f -= value("joint_friction")[i] * np.clip(v / CREEP, -1.0, 1.0)
-        most = value("joint_velocity_limit")[i]
+        f -= friction * min(max(v / CREEP, -1.0), 1.0)
         if most < NONE:
             f += heavy[i] * (max(-most - v, 0.0) - max(v - most, 0.0))
         return f
@@ -60,7 +65,8 @@ def step(scene, world, h, q, qd, tau, body_f=None, target_q=None, target_qd=None
         before = v.copy()
         for i in range(len(v)):
             others = load[i] - M[i] @ (v - qd) / h + M[i, i] * v[i] / h
-            v[i] = _root(lambda x, i=i, others=others: M[i, i] * x / h - others - force(i, x), v[i])
+            mass, others = float(M[i, i]), float(others)
+            v[i] = _root(lambda x, i=i, mass=mass, others=others: mass * x / h - others - force(i, x), float(v[i]))
         if np.abs(v - before).max() <= 1e-15 * np.abs(v).max():
             break
     return d.integrate(v, h), v

@@ -188,7 +188,8 @@ def plant(monkeypatch, owner, name, old, new):
     if inspect.ismodule(owner):  # and every module that imports the function by name
         modules = [module for key, module in sys.modules.items() if key.startswith(warp_spo.__name__)]
         holders = [module for module in modules if getattr(module, name, None) is original]
-        for routine in (one for one in gc.get_objects() if type(one) is Routine and one.trace is original):
-            monkeypatch.setitem(routine.__dict__, "trace", space[name])
+        for one in gc.get_referrers(original):  # routines, or the dictionaries of their attributes
+            if type(one) is Routine or (type(one) is dict and one.get("trace") is original):
+                monkeypatch.setitem(one if type(one) is dict else one.__dict__, "trace", space[name])
     for holder in holders:
         monkeypatch.setattr(holder, name, space[name])

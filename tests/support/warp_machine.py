@@ -5,6 +5,7 @@ memory that warps share remembers who touched what between which barriers: readi
 another warp writes between the same two barriers, is an error, as it is a matter of luck on a GPU.
 """
 
+import functools
 import re
 from typing import NamedTuple
 
@@ -222,6 +223,7 @@ def translated(cuda):
     return "\n".join([*lines, "    if False:", "        yield"])
 
 
+@functools.lru_cache(1 << 17)  # of kernels that are nearly alike
 def _statement(line):
     if "farthest" in line:
         return "pass"  # turns are not taken off here

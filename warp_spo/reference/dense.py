@@ -16,6 +16,7 @@ import numpy as np
 
 from .kinematics import Motion
 from .rotations import (
+    cross,
     homogeneous,
     pose7,
     quaternion,
@@ -94,7 +95,7 @@ class Dense(Motion):
                     axis, angular, linear = hinge.screws[i]
                     direction, point = self.stages[k][i][:3, :3] @ axis, self.stages[k][i][:3, 3]
                     omega, v = angular * direction, linear * direction
-                H[dof, self.rows[k]] = np.concatenate([R.T @ omega, R.T @ (v + np.cross(omega, origin - point))])
+                H[dof, self.rows[k]] = np.concatenate([R.T @ omega, R.T @ (v + cross(omega, origin - point))])
         return H
 
     @cached_property
@@ -190,8 +191,8 @@ class Dense(Motion):
         found = []
         for k, (mass, com, inertia, _) in enumerate(self._matter[: self.body_count]):
             r = com - self.node_matrix[k][:3, 3]
-            a = A[k] + np.cross(AL[k], r) + np.cross(W[k], np.cross(W[k], r))
-            found.append(np.concatenate([mass * a, inertia @ AL[k] + np.cross(W[k], inertia @ W[k])]))
+            a = A[k] + cross(AL[k], r) + cross(W[k], cross(W[k], r))
+            found.append(np.concatenate([mass * a, inertia @ AL[k] + cross(W[k], inertia @ W[k])]))
         return found + self._rotors.efforts(qd, qdd, (W, V, A, AL))
 
     def inverse_dynamics(self, qd, qdd, body_f=None):
@@ -248,14 +249,14 @@ class Dense(Motion):
         for k, matrix in enumerate(self.body_matrix):
             R, origin, w, al = matrix[:3, :3], matrix[:3, 3], W[k], AL[k]
             r = origin - self.node_matrix[k][:3, 3]
-            a = A[k] + np.cross(al, r) + np.cross(w, np.cross(w, r)) - self.value("gravity")
+            a = A[k] + cross(al, r) + cross(w, cross(w, r)) - self.value("gravity")
             J = self._jacobian_at(k, origin)
             for i, unit in enumerate(np.eye(10)):
                 m, h, I = unit[0], R @ unit[1:4], np.zeros((3, 3))
                 I[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]] = I[[0, 1, 1, 2, 2, 2], [0, 0, 1, 0, 1, 2]] = unit[4:]
                 I = R @ I @ R.T
-                force = m * a + np.cross(al, h) + np.cross(w, np.cross(w, h))
-                moment = np.cross(h, a) + I @ al + np.cross(w, I @ w)
+                force = m * a + cross(al, h) + cross(w, cross(w, h))
+                moment = cross(h, a) + I @ al + cross(w, I @ w)
                 Y[:, 10 * k + i] = J.T @ np.concatenate([force, moment])
         return Y
 
@@ -315,7 +316,7 @@ class Dense(Motion):
         total, c = np.zeros(6), self.center_of_mass
         for (_, com, *_), effort in zip(self._matter, self._efforts(self._qd(qd), 0.0 * self.qd), strict=True):
             total[:3] += effort[:3]
-            total[3:] += effort[3:] + np.cross(com - c, effort[:3])
+            total[3:] += effort[3:] + cross(com - c, effort[:3])
         return total
 
     @cached_property

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from .jets import curve
-from .rotations import homogeneous, pose7, quaternion_product, rotation, rotation_about, rotation_vector, skew
+from .rotations import cross, homogeneous, pose7, quaternion_product, rotation, rotation_about, rotation_vector, skew
 
 
 class Motion:
@@ -112,7 +112,6 @@ class Motion:
         All are [node, 3] in world axes; the formulas are the derivatives of the poses along the chain of frames.
         """
         W, V, A, AL = np.zeros((4, self.body_count, 3))
-        cross = np.cross
         for k in self.outward:
             anchor, node, p = self.stages[k][0], self.node_matrix[k], self.parent[k]
             w, v, a, al = np.zeros((4, 3))
@@ -199,7 +198,7 @@ class Motion:
         rows = []
         for body, matrix in map(self._at, frames):
             r = matrix[:3, 3] - self.node_matrix[body][:3, 3]
-            acceleration = A[body] + np.cross(AL[body], r) + np.cross(W[body], np.cross(W[body], r))
+            acceleration = A[body] + cross(AL[body], r) + cross(W[body], cross(W[body], r))
             rows.append(np.concatenate([acceleration, AL[body]]))
         return np.array(rows)
 

@@ -9,6 +9,12 @@ def skew(vector):
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
+def cross(a, b):
+    """Return a x b of two arrays of shape (3,), as ``np.cross`` does in 30 times the time."""
+    (x, y, z), (u, v, w) = a.tolist(), b.tolist()
+    return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+
+
 def rotation_about(axis, angle):
     """Return the rotation matrix (3, 3) by an angle [rad] of any size about a unit vector."""
     k = skew(axis)
@@ -33,7 +39,7 @@ def quaternion(matrix):
 
 def quaternion_product(a, b):
     """Return the quaternion xyzw of the rotation b followed by a."""
-    return np.array([*(a[3] * b[:3] + b[3] * a[:3] + np.cross(a[:3], b[:3])), a[3] * b[3] - a[:3] @ b[:3]])
+    return np.array([*(a[3] * b[:3] + b[3] * a[:3] + cross(a[:3], b[:3])), a[3] * b[3] - a[:3] @ b[:3]])
 
 
 def rotation_vector(matrix):

@@ -6,6 +6,8 @@ One whose parent no hinge can move only spins.
 
 import numpy as np
 
+from .rotations import cross
+
 
 def moving(dense):
     """Return whether some hinge moves the body [body + 1]; the last is the inertial frame."""
@@ -52,8 +54,8 @@ class Rotors:
             w, a, al = np.zeros((3, 3))
             if parent >= 0:
                 w, al, r = motion[0][parent], motion[3][parent], com - self.dense.node_matrix[parent][:3, 3]
-                a = motion[2][parent] + np.cross(al, r) + np.cross(w, np.cross(w, r))
+                a = motion[2][parent] + cross(al, r) + cross(w, cross(w, r))
             spin = ratio * qd[dof] * u
-            al, w = al + ratio * qdd[dof] * u + np.cross(w, spin), w + spin
-            found.append(np.concatenate([mass * a, inertia @ al + np.cross(w, inertia @ w)]))
+            al, w = al + ratio * qdd[dof] * u + cross(w, spin), w + spin
+            found.append(np.concatenate([mass * a, inertia @ al + cross(w, inertia @ w)]))
         return found

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .scalars import BRANCHES, Value, is_constant, ordered
+from .scalars import BRANCHES, Scalar, Value, is_constant, ordered
 
 FUNCTIONS: dict[str, Callable] = {
     "add": lambda a, b: a + b,
@@ -58,7 +58,11 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
             numbers, entry = np.asarray(load(table, ()), dtype=dtype), width * row + column
             values[scalar.key] = numbers[(..., entry) if numbers.ndim == 1 else (np.arange(len(numbers)), entry)]
         else:
-            given = (a for a in scalar.args if not isinstance(a, str))  # without the name of a branch
-            args = [np.asarray(a, dtype=dtype) if is_constant(a) else values[a.key] for a in given]
+            args = []
+            for a in scalar.args:
+                if a.__class__ is Scalar:
+                    args.append(values[a.key])
+                elif a.__class__ is not str:  # the name of a branch
+                    args.append(np.asarray(a, dtype=dtype))
             values[scalar.key] = np.asarray(FUNCTIONS[scalar.op](*args), dtype=dtype)
     return [np.asarray(o, dtype=dtype) if is_constant(o) else values[o.key] for o in outputs]

@@ -46,7 +46,7 @@ class Graph:
 
     def make(self, op: str, *args: Any) -> Scalar:
         """Return the scalar of an operation, without simplification; equal operations give the same scalar."""
-        key = (op, *[a if a.__class__ is not Scalar else a.key for a in args])
+        key = (op, *args)  # scalars are equal if they are one
         known = self._known.get(key)
         if known is None:
             known = self._known[key] = Scalar(self, op, args, len(self._known))
@@ -123,12 +123,12 @@ def negative(x: Value) -> Value:
 
 def add(x: Value, y: Value) -> Value:
     """Return x + y; a constant is stored as the second argument, otherwise the older scalar as the first."""
-    if is_constant(x):
+    if x.__class__ is not Scalar:
         x, y = y, x
-    if is_constant(x):
+    if x.__class__ is not Scalar:
         return x + y
     graph = x.graph
-    if is_constant(y):
+    if y.__class__ is not Scalar:
         if y == 0.0:
             return x
         if x.op == "add" and is_constant(x.args[1]):
@@ -145,12 +145,12 @@ def add(x: Value, y: Value) -> Value:
 
 def multiply(x: Value, y: Value) -> Value:
     """Return x y; a constant, or else the older scalar, is stored as the first argument."""
-    if is_constant(y):
+    if y.__class__ is not Scalar:
         x, y = y, x
-    if is_constant(y):
+    if y.__class__ is not Scalar:
         return x * y
     graph = y.graph
-    if is_constant(x):
+    if x.__class__ is not Scalar:
         if x == 0.0:
             return 0.0
         if x == 1.0:
@@ -359,21 +359,26 @@ def ordered(outputs: Iterable[Value], known: Iterable[Scalar] = ()) -> list[Scal
 
     The list leaves out the scalars in ``known``, and the scalars that only these need.
     """
-    seen: set[tuple] = {x.key for x in known}
+    seen: set[Scalar] = set(known)
     order: list[Scalar] = []
     for output in outputs:
-        if is_constant(output) or output.key in seen:
+        if output.__class__ is not Scalar or output in seen:
             continue
-        stack: list[tuple[Scalar, Any]] = [(output, iter(output.args))]
-        seen.add(output.key)
-        while stack:
-            scalar, rest = stack[-1]
+        seen.add(output)
+        path, rest, rests = (
+            [output],
+            iter(output.args),
+            [],
+        )  # from the output inward; arguments of its end, of the others
+        while path:
             for argument in rest:
-                if argument.__class__ is Scalar and argument.key not in seen:
-                    seen.add(argument.key)
-                    stack.append((argument, iter(argument.args)))
+                if argument.__class__ is Scalar and argument not in seen:
+                    seen.add(argument)
+                    path.append(argument)
+                    rests.append(rest)
+                    rest = iter(argument.args)
                     break
             else:
-                order.append(scalar)
-                stack.pop()
+                order.append(path.pop())
+                rest = rests.pop() if rests else iter(())
     return order
