@@ -104,12 +104,7 @@ BUGS = {
     "what passes begin with": (PassGradient, "stores", "select(pass_variables.first, gradient, 0.0)", "0.0"),
     "a load held": (PassGradient, "stores", "seeds += [1.0,", "seeds += [0.0,"),
     "a load held before": (PassSolve, "stores", "[*seeds, 1.0]", "[*seeds, 0.0]"),
-    "dampers left out": (
-        PassSolve,
-        "stores",
-        "trace.with_step_armature = self._with_resistance",
-        "trace.contact_inertia = {}",
-    ),
+    "dampers left out": (PassSolve, "stores", "terms=terms", "terms=type(terms)(force=pushes)"),
     "points that do not press": (PassSolve, "stores", "Vector(wrenches[6 * at", "0.0 * Vector(wrenches[6 * at"),
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,24 @@ Factors = dict[int, Any]
 NO_FORCE = Vector((*ZERO, *ZERO))
 
 
+@dataclasses.dataclass(frozen=True)
+class StepTerms:
+    """What a time step adds to the equations of motion of links.
+
+    Attributes:
+        with_armature: returns a link with what the laws of its joints add to its armature.
+        inertia, force: by id of the link: what contacts add to its articulated inertia, and to the forces on it; of a
+            segment also for the link that it moves on.
+    """
+
+    with_armature: Callable[[Link], Link] = dataclasses.field(default=lambda link: link)
+    inertia: dict[int, Articulated] = dataclasses.field(default_factory=dict)
+    force: dict[int, Vector] = dataclasses.field(default_factory=dict)
+
+
+NO_TERMS = StepTerms()
+
+
 def factor_tree(trace: Trace) -> Factors:
     """Return the factor of every link, by id."""
     return factor(trace)[0]
@@ -45,13 +64,18 @@ def factor(trace: Trace) -> tuple[Factors, list[Store]]:
 
 
 def eliminate(
-    trace: Trace, link: Link, done: Factors, inner: dict[int, Articulated], factor: Callable = articulated.factor
+    trace: Trace,
+    link: Link,
+    done: Factors,
+    inner: dict[int, Articulated],
+    factor: Callable = articulated.factor,
+    terms: StepTerms = NO_TERMS,
 ) -> None:
     """Add the factor of a link to ``done``, and P+ in its parent's frame to ``inner``, after its children's."""
     trace.label(link, "P")
     carried = trace.exchange.from_children(link, "P", inner, Articulated.unpacked)
-    if id(link) in trace.contact_inertia:
-        carried = [*carried, trace.contact_inertia[id(link)]]
+    if id(link) in terms.inertia:
+        carried = [*carried, terms.inertia[id(link)]]
     if link.shared_dofs is not None:
         P = total_inertia(link, carried)
         done[id(link)] = articulated.LinkFactor([], P, NO_INERTIA, False, False, 0.0)
@@ -59,12 +83,12 @@ def eliminate(
         if link.is_last:
             leader = link.shared_dofs.links[0]
             own = {id(one): done[id(one)].P for one in link.shared_dofs.links}
-            together = shared_dofs.factor(trace.with_step_armature(leader), trace.places, own, trace.epsilon)
+            together = shared_dofs.factor(terms.with_armature(leader), trace.places, own, trace.epsilon)
             done[id(leader)], inner[id(link)] = together, together.in_parent
         return
     through = [inside(trace, child, done) for child in link.children if id(child) in done]
     place = trace.places[id(link)]
-    done[id(link)] = found = factor(trace.with_step_armature(link), place, carried, through, trace.epsilon)
+    done[id(link)] = found = factor(terms.with_armature(link), place, carried, through, trace.epsilon)
     inner[id(link)] = found.in_parent
 
 
@@ -90,6 +114,7 @@ def reduce(
     loads: bool,
     letters: str = "Pz",
     phases: PhaseBuilder | None = None,
+    terms: StepTerms = NO_TERMS,
 ) -> tuple[dict, dict, list[Store]]:
     """Sweep inward: return the factors, D^-1 [I - H psi K] (tau - velocity terms - loads), and the stores that send.
 
@@ -97,6 +122,7 @@ def reduce(
         tau: force of a dof. moves: links have velocities. loads: subtract the external wrenches.
         letters: of the messages to other segments; "P" among them sends the articulated inertias.
         phases: receives what does not change from pass to pass, where passes repeat the sweep.
+        terms: what a time step adds to the links.
     """
     done: Factors = {}
     rates: dict[int, list[Value]] = {}
@@ -109,7 +135,7 @@ def reduce(
         if outward:
             trace.place(link, moves)
             continue
-        eliminate(trace, link, done, inner)
+        eliminate(trace, link, done, inner, terms=terms)
         place, move, factor = trace.places[key], trace.motions[key], done[key]
         trace.label(link, "z")
         z = articulated.gyroscopic(link.inertia, move)
@@ -118,8 +144,8 @@ def reduce(
         if phases is not None:
             bias = *move.bias_w, *move.bias_v, *move.bias_l
             phases.add_invariants([*(place.pose.turn or ()), *bias, *z])
-        if key in trace.contact_force:
-            z = z - trace.contact_force[key]
+        if key in terms.force:
+            z = z - terms.force[key]
         for force in trace.exchange.from_children(link, letters[-1], forces, Vector):
             z = z + force
         if link.shared_dofs is None:
@@ -132,9 +158,7 @@ def reduce(
                 rates[leader], _, forces[key] = shared_dofs.reduce(
                     done[leader], trace.places, trace.motions, waiting, right
                 )
-        carried, force = trace.exchange.add_contacts(
-            link, inner[key], forces[key], trace.contact_inertia, trace.contact_force
-        )
+        carried, force = trace.exchange.add_contacts(link, inner[key], forces[key], terms.inertia, terms.force)
         stores += trace.exchange.send_to_parent("P", link, carried.packed) if "P" in letters else []
         stores += trace.exchange.send_to_parent(letters[-1], link, force)
     return done, rates, stores

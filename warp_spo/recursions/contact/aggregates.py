@@ -21,7 +21,7 @@ from ...trace.scalars import Value, branch, guarded, reciprocal
 from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Pose, Vector, cross, dot, total
 from .. import articulated
 from ..articulated import NO_INERTIA
-from ..articulated_sweeps import NO_FORCE, Factors, eliminate
+from ..articulated_sweeps import NO_FORCE, Factors, StepTerms, eliminate
 from ..model.links import Link
 from ..motion import STILL, carry_acceleration, hinge_entries, hinge_motion
 from .ties import Aggregate, TiePlan, key
@@ -77,14 +77,20 @@ class Node:
 
     # -- inward ----------------------------------------------------------------------------------------------------
     def close(
-        self, inner: dict[int, Articulated], forces: dict[int, Vector], own: dict[int, Vector], tau: Callable
+        self,
+        terms: StepTerms,
+        inner: dict[int, Articulated],
+        forces: dict[int, Vector],
+        own: dict[int, Vector],
+        tau: Callable,
     ) -> None:
         """Eliminate the aggregate: put what its base gets in the place of what its links would leave there.
 
         Args:
+            terms: what the step adds to the links; receives what the base gets if none of the links hangs on it.
             inner, forces: P+ and z+ of links in their parents' frames. own: z of each link without those it carries.
         """
-        trace, (D, U, eps, P, z) = self.trace, self._system(inner, forces, own, tau)
+        trace, (D, U, eps, P, z) = self.trace, self._system(terms, inner, forces, own, tau)
         trace.label(self.aggregate.links[0], "D")
         rows: list[list[Value]] = []
         G: list[Vector] = []
@@ -122,14 +128,14 @@ class Node:
             return
         P, z = Articulated.unpacked([next(take) for _ in range(21)]), Vector(take)
         if not tops:
-            add(trace.contact_inertia, id(base), P)
-            add(trace.contact_force, id(base), -z)
+            add(terms.inertia, id(base), P)
+            add(terms.force, id(base), -z)
         for link in tops:
             first = link is tops[0]
             inner[id(link)], forces[id(link)] = (P, z) if first else (NO_INERTIA, NO_FORCE)
 
     def _system(
-        self, inner: dict, forces: dict, own: dict, tau: Callable
+        self, terms: StepTerms, inner: dict, forces: dict, own: dict, tau: Callable
     ) -> tuple[dict, list, list, Articulated, Vector]:
         """Return D, U, eps, and what the base would carry if no dof moved: an inertia and a force, in its frame."""
         trace, mine, base = self.trace, {id(link) for link in self.aggregate.links}, self.aggregate.base
@@ -144,7 +150,7 @@ class Node:
             P = NO_INERTIA if link.inertia is None else link.inertia.articulated
             for child in link.children:
                 P = P if id(child) in mine else P + inner[id(child)]
-            P = P + trace.contact_inertia[id(link)] if id(link) in trace.contact_inertia else P
+            P = P + terms.inertia[id(link)] if id(link) in terms.inertia else P
             P, z = P + whole.get(id(link), NO_INERTIA), own[id(link)] + push.get(id(link), NO_FORCE)
             (pose, H), right = self._hinge(link), [tau(dof) for dof in link.dofs]
             if id(link) in self.plan.carried:
@@ -152,7 +158,7 @@ class Node:
                 f, n = (link.hinge.in_link_axes(place, right[part : part + 3]) for part in (0, 3))
                 z, right = force_to_parent(turn, z - Vector((*n, *f))), [0.0] * 6
                 P = turn.articulated_to_parent(P)
-            stiffened, over = trace.with_step_armature(link), self.plan.over[id(link)]
+            stiffened, over = terms.with_armature(link), self.plan.over[id(link)]
             whole[key(over)] = whole.get(key(over), NO_INERTIA) + pose.articulated_to_parent(P)
             push[key(over)] = push.get(key(over), NO_FORCE) + force_to_parent(pose, z)
             for i, column in enumerate(H):
@@ -263,7 +269,12 @@ def force_to_parent(pose: Pose, z: Vector) -> Vector:
 
 
 def reduce(
-    trace: Trace, plan: TiePlan, nodes: dict[int, Node], tau: Callable[[int], Value], phases: PhaseBuilder
+    trace: Trace,
+    plan: TiePlan,
+    nodes: dict[int, Node],
+    terms: StepTerms,
+    tau: Callable[[int], Value],
+    phases: PhaseBuilder,
 ) -> tuple[Factors, dict]:
     """Sweep inward; ``nodes`` by id of the first link of each aggregate. Return factors and D^-1 eps, by link."""
     done: Factors = {}
@@ -276,10 +287,10 @@ def reduce(
         phases.add_invariants(trace.places[id(link)].pose.turn or ())
     for link in reversed(plan.order):
         at, place = id(link), trace.places[id(link)]
-        eliminate(trace, link, done, inner)
+        eliminate(trace, link, done, inner, terms=terms)
         trace.label(link, "z")
         mine = {id(one) for one in plan.of[at].links} if at in plan.of else set()
-        z = -trace.contact_force[at] if at in trace.contact_force else NO_FORCE
+        z = -terms.force[at] if at in terms.force else NO_FORCE
         own[at] = z
         for child in link.children:
             own[at] = own[at] if id(child) in mine else own[at] + forces[id(child)]
@@ -288,7 +299,7 @@ def reduce(
             link, place, done[at], STILL, z, [tau(dof) for dof in link.dofs]
         )
         if at in nodes:
-            nodes[at].close(inner, forces, own, tau)
+            nodes[at].close(terms, inner, forces, own, tau)
     return done, rates
 
 

@@ -13,7 +13,7 @@ from ...trace.emission import Store
 from ...trace.scalars import Value
 from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Vector, cross, total
 from .. import articulated
-from ..articulated_sweeps import Factors
+from ..articulated_sweeps import Factors, StepTerms
 from ..model.links import Link, Links
 from ..step.phases import StepPhases
 from . import aggregates
@@ -62,17 +62,16 @@ class CoupledStep(ContactStepTrace):
             epilogue=found.epilogue + reported,
         )
 
-    def inward(self, tau: Callable[[int], Value]) -> tuple[Factors, dict, list[Store]]:
+    def inward(self, terms: StepTerms, tau: Callable[[int], Value]) -> tuple[Factors, dict, list[Store]]:
         """Return factors and D^-1 eps of a pass by link, for forces of the dofs; no stores that send."""
-        return *aggregates.reduce(self.trace, self.plan, self.nodes, tau, self.phases), []
+        return *aggregates.reduce(self.trace, self.plan, self.nodes, terms, tau, self.phases), []
 
     def outward(self, done: Factors, rates: dict, alpha: dict[int, tuple[Vector, Vector]]) -> list[Store]:
         """Return the stores of qdd; ``alpha`` receives the accelerations of links by id."""
         return aggregates.expand(self.trace, self.plan, self.nodes, done, rates, alpha)
 
-    def _press(self, points: list[TracedContactPoint], states: list[PointState]) -> None:
-        super()._press(points, states)
-        trace = self.trace
+    def _step_terms(self, points: list[TracedContactPoint], states: list[PointState]) -> StepTerms:
+        trace, terms = self.trace, super()._step_terms(points, states)
         self.plan = TiePlan(trace.links, couples_of(trace.links), lambda link: flies(self._with_resistance(link)))
         self.couples = self.plan.couples
         passes = trace.graph.input("passes", 0)  # native code counts them, too
@@ -100,8 +99,8 @@ class CoupledStep(ContactStepTrace):
             if couple.ties:
                 ties[number] = Tie(K, load, self._columns(number, couple))
             elif couple.g is None:
-                add(trace.contact_inertia, id(couple.f), K)
-                add(trace.contact_force, id(couple.f), load)
+                add(terms.inertia, id(couple.f), K)
+                add(terms.force, id(couple.f), load)
         self.nodes: dict[int, Node] = {}
         for aggregate in self.plan.aggregates:
             mask = total(trace.graph.input(COUPLED, number) for number in aggregate.couples)
@@ -112,6 +111,7 @@ class CoupledStep(ContactStepTrace):
             for seat in seats.values():
                 self.phases.add_invariants([*(x for row in seat.turn for x in row), *seat.at])
         self.phases.add_invariants(x for R, _ in self.frames.values() for row in R for x in row)
+        return terms
 
     def _frames(self, links: list[Link | None]) -> dict[int | None, tuple[Matrix, Vector]]:
         """Return axes and origins of links in the inertial frame."""

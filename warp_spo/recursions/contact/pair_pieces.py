@@ -17,13 +17,14 @@ from ...trace.emission import Store
 from ...trace.scalars import Value, inverse_root
 from ...trace.spatial import Articulated, Matrix, Vector, cross, dot, total
 from ..articulated import reduce_link
-from ..articulated_sweeps import NO_FORCE
+from ..articulated_sweeps import NO_FORCE, StepTerms
 from ..kinematics import frame_on_link, velocity
-from ..model.links import Link, Links
+from ..model.links import Links
 from ..model.messages import INWARD, OUTWARD
 from ..model.segments import Segment, Segments
 from ..motion import STILL
 from ..step.phases import StepPhases
+from .aggregates import add
 from .coupled import CoupledStep, is_supported
 from .couples import EXCESS, Team
 from .pairs import (
@@ -131,9 +132,8 @@ class PairedSegment(ContactStepTrace):
         return found._replace(prologue=found.prologue + self.first, sweep=found.sweep + self.twists)
 
     # -- before the passes -----------------------------------------------------------------------------------------
-    def _press(self, points: list[TracedContactPoint], states: list[PointState]) -> None:
-        super()._press(points, states)
-        trace = self.trace
+    def _step_terms(self, points: list[TracedContactPoint], states: list[PointState]) -> StepTerms:
+        trace, terms = self.trace, super()._step_terms(points, states)
         assert trace.segment is not None
         self.frames = tuple((body, (0.0, 0.0, 0.0)) for body in self.own.values())
         self.seats = {number: frame_on_link(trace, *frame) for number, frame in zip(self.own, self.frames, strict=True)}
@@ -153,15 +153,14 @@ class PairedSegment(ContactStepTrace):
             (w, v), R = self.before[id(link)], trace.axes[id(link)]
             self._store(self.first, "twist", number, 6, (*velocity(R, w, v, arm), *(R @ w)))
             self.phases.add_invariants([*(entry for row in R for entry in row), *w, *v])
-            self._add_push(link, self._wrench(number, INWARD))
+            add(terms.force, id(link), self._wrench(number, INWARD))
         if self.is_base:
             link = trace.segment.links[-1]
             trace.label(link, "K")
             given = [trace.graph.input(INWARD, self.at["base"] + i) for i in range(27)]
-            inertia = Articulated.unpacked(given[:21])
-            known = trace.contact_inertia.get(id(link))
-            trace.contact_inertia[id(link)] = inertia if known is None else known + inertia
-            self._add_push(link, Vector(given[21:]))
+            add(terms.inertia, id(link), Articulated.unpacked(given[:21]))
+            add(terms.force, id(link), Vector(given[21:]))
+        return terms
 
     def _store(self, to: list[Store], name: str, number: int, size: int, values: Iterable[Value]) -> None:
         first = self.at[name] + number * size
@@ -174,10 +173,6 @@ class PairedSegment(ContactStepTrace):
         back: Matrix = self.trace.axes[id(link)].T
         f, n = (back @ Vector(given[3 * part : 3 * part + 3]) for part in range(2))
         return Vector((*(n + cross(arm, f)), *f))
-
-    def _add_push(self, link: Link, push: Vector) -> None:
-        known = self.trace.contact_force.get(id(link))
-        self.trace.contact_force[id(link)] = push if known is None else known + push
 
     # -- passes ----------------------------------------------------------------------------------------------------
     def close(self, done: dict, rates: dict) -> dict:

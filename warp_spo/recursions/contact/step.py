@@ -18,7 +18,7 @@ from ...status import Status
 from ...trace.emission import Store
 from ...trace.scalars import Value, branch, is_constant, less, reciprocal, select
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
-from ..articulated_sweeps import Factors, expand, reduce
+from ..articulated_sweeps import Factors, StepTerms, expand, reduce
 from ..coordinates import integrate_link
 from ..kinematics import zero
 from ..model.links import Link
@@ -85,10 +85,8 @@ class ContactStepTrace(Step):
         phases.add_invariants(bias.values())
         phases.add_invariants(value for point in points for value in point.kept_values(arms))
         phases.add_invariants(value for group in self.cull_groups.values() for value in (group.highest, group.reach))
-        self._press(points, states)
-        trace.with_step_armature = self._with_resistance
-        tau = trace.vector("tau")
-        done, rates, sent = self.inward(lambda dof: tau(dof) + self.forces[dof] - bias[dof])
+        terms, tau = self._step_terms(points, states), trace.vector("tau")
+        done, rates, sent = self.inward(terms, lambda dof: tau(dof) + self.forces[dof] - bias[dof])
         rates = self.close(done, rates)
         alpha: dict[int, tuple[Vector, Vector]] = {}
         moved = self.outward(done, rates, alpha)
@@ -146,9 +144,9 @@ class ContactStepTrace(Step):
         bias = {item.index[0]: item.value for item in found if item.array == "out"}
         return bias, [item for item in found if item.array != "out"]
 
-    def inward(self, tau: Callable[[int], Value]) -> tuple[Factors, dict, list[Store]]:
+    def inward(self, terms: StepTerms, tau: Callable[[int], Value]) -> tuple[Factors, dict, list[Store]]:
         """Return factors and D^-1 eps of a pass by link, for forces of the dofs, and the stores that send."""
-        return reduce(self.trace, tau, moves=False, loads=False, phases=self.phases)
+        return reduce(self.trace, tau, moves=False, loads=False, phases=self.phases, terms=terms)
 
     def outward(self, done: Factors, rates: dict, alpha: dict[int, tuple[Vector, Vector]]) -> list[Store]:
         """Return the stores of qdd; ``alpha`` receives the accelerations of links by id."""
@@ -231,14 +229,14 @@ class ContactStepTrace(Step):
         """Return friction's damper before the first pass, and whether the step may reach the ground."""
         return begin_point(point, self.trace.links.gravity, self.h)
 
-    def _press(self, points: list[TracedContactPoint], states: list[PointState]) -> None:
-        """Add dampers and loads of the points to their links."""
-        trace, on = self.trace, dict[int, list[tuple[TracedContactPoint, PointState]]]()
+    def _step_terms(self, points: list[TracedContactPoint], states: list[PointState]) -> StepTerms:
+        """Return what the laws of the joints, and dampers and loads of the points, add to the links."""
+        terms, on = StepTerms(self._with_resistance), dict[int, list[tuple[TracedContactPoint, PointState]]]()
         for point, state in zip(points, states, strict=True):
             if point.link is not None:
                 on.setdefault(id(point.link), []).append((point, state))
         for key, pressed in on.items():
-            trace.label(pressed[0][0].link, "c")  # type: ignore[arg-type]
+            self.trace.label(pressed[0][0].link, "c")  # type: ignore[arg-type]
             floors = [x for x in pressed if x[0].near is None or is_constant(x[0].near)]
             P, push = self._sum(floors)
             if pressed[0][0].near is not None:  # the points of a ground with walls are rarely near it all at once
@@ -251,7 +249,8 @@ class ContactStepTrace(Step):
                 P, push = chosen(touched, (P + more, push + pushed), (P, push), f"walls of {key}")
             if key in self.cull_groups:
                 P, push = self.cull_groups[key].damper_and_load(P, push)
-            trace.contact_inertia[key], trace.contact_force[key] = P, push
+            terms.inertia[key], terms.force[key] = P, push
+        return terms
 
     def _sum(self, pressed: list[tuple[TracedContactPoint, PointState]]) -> tuple[Articulated, Vector]:
         """Return the sums of dampers and loads of points of one link."""

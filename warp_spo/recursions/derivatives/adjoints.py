@@ -20,7 +20,7 @@ from ...trace.differentiation import forward, reverse
 from ...trace.emission import Store
 from ...trace.scalars import Scalar, Value, ordered
 from ...trace.spatial import ZERO, total
-from ..articulated_sweeps import expand, reduce
+from ..articulated_sweeps import NO_TERMS, StepTerms, expand, reduce
 from ..composite import mass_matrix
 from ..coordinates import difference, integrate, integrate_link, interpolate
 from ..energy import kinetic_energy, potential_energy
@@ -46,9 +46,9 @@ class TreeEquations:
     def __init__(self, trace: Trace):
         self.trace = trace
 
-    def solve(self, right: Entry) -> dict[int, Value]:
-        """Return Mass^-1 ``right``, by dof."""
-        done, rates, _ = reduce(self.trace, right, moves=False, loads=False)
+    def solve(self, right: Entry, terms: StepTerms = NO_TERMS) -> dict[int, Value]:
+        """Return Mass^-1 ``right``, by dof; Mass with what a time step adds to it, ``terms``."""
+        done, rates, _ = reduce(self.trace, right, moves=False, loads=False, terms=terms)
         return {item.index[0]: item.value for item in expand(self.trace, done, rates, (ZERO, ZERO))}
 
     def gradient(self, solved: dict[int, Value], qdd: Entry, tau: Entry, right: Entry) -> Gradients:
@@ -219,8 +219,7 @@ def step_vjp(trace: Trace, wrt: tuple[str, ...], equations: TreeEquations | None
         armature = (a + stiff[dof] for a, dof in zip(link.armature, link.dofs, strict=True))
         return dataclasses.replace(link, armature=tuple(armature))
 
-    trace.with_step_armature = stiffened
-    solved, tau = equations.solve(lambda dof: h * rates[dof]), trace.vector("tau")
+    solved, tau = equations.solve(lambda dof: h * rates[dof], StepTerms(stiffened)), trace.vector("tau")
     right = {dof: h * rates[dof] - stiff[dof] * solved[dof] for dof in dofs}
     gradients = equations.gradient(solved, qdd, lambda dof: tau(dof) + forces[dof], right.__getitem__)
     inputs = [x for x in ordered(forces.values()) if x.op == "input"]

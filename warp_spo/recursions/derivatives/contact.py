@@ -25,6 +25,7 @@ the step is.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
@@ -36,7 +37,7 @@ from ...trace.differentiation import reverse
 from ...trace.emission import Store
 from ...trace.scalars import Scalar, Value, cut, is_constant, less, ordered, select
 from ...trace.spatial import ZERO, Articulated, Vector, dot, total
-from ..articulated_sweeps import Factors, eliminate, expand, reduce
+from ..articulated_sweeps import NO_TERMS, Factors, eliminate, expand, reduce
 from ..contact.ground import CORNERS
 from ..contact.points import (
     ContactLinkMotion,
@@ -82,7 +83,7 @@ class PassAdjoint(OnePass):
         last: 1 in the last pass, else 0. qdd: what the pass found by dof, cut from its history. gains: h qdd.
         points, touches: contact points and their variables. moving: (J qdd) of links by id.
         loads: forces on the points, at the velocities that qdd gives.
-        inner: P+ of the trace's links, in their parents' frames, by id.
+        inner: P+ of the trace's links, in their parents' frames, by id. terms: what the pass adds to the links.
     """
 
     def __init__(self, trace: Trace, laws: tuple[int, ...]):
@@ -95,6 +96,7 @@ class PassAdjoint(OnePass):
         self.qdd = {dof: cut(trace.vector("qdd")(dof)) for dof in self.before}
         self.gains = {dof: self.h * rate for dof, rate in self.qdd.items()}
         self.inner: dict[int, Articulated] = {}
+        self.terms = NO_TERMS
         done = self._factors()
         for link in self.links:
             for dof in link.dofs:
@@ -109,13 +111,12 @@ class PassAdjoint(OnePass):
         trace, done = self.trace, Factors()
         if not (self._carrier or any(map(self._weighs, self.links))):
             return done
-        self._press(self.points, self.states)
-        trace.contact_force, trace.with_step_armature = {}, self._with_resistance
+        self.terms = self._step_terms(self.points, self.states)
         for link, outward in trace.traversal():
             if outward:
                 trace.place(link)
             else:
-                eliminate(trace, link, done, self.inner)
+                eliminate(trace, link, done, self.inner, terms=self.terms)
         return done
 
     @property
@@ -130,10 +131,8 @@ class PassAdjoint(OnePass):
         if self._carrier is None:
             return []
         link = self.trace.own_links[0]
-        P = self.inner[id(link)]
-        return (
-            P + self.trace.contact_inertia[id(link.parent)] if id(link.parent) in self.trace.contact_inertia else P
-        ).packed
+        P, over = self.inner[id(link)], id(link.parent)
+        return (P + self.terms.inertia[over] if over in self.terms.inertia else P).packed
 
     def _find_points(self) -> list[TracedContactPoint]:
         """Return the contact points."""
@@ -207,11 +206,10 @@ class PassSolve(PassAdjoint):
         right = {
             dof: gradient + self._of_later(COTANGENT, dof) for dof, gradient in zip(self.qdd, direct, strict=False)
         }
-        self._press(self.points, self.states)
-        wrenches = direct[len(self.qdd) :]
-        trace.contact_force = {key: Vector(wrenches[6 * at : 6 * at + 6]) for at, key in enumerate(on)}
-        trace.with_step_armature = self._with_resistance
-        done, rates, sent = reduce(trace, right.__getitem__, moves=False, loads=False)
+        self.terms, wrenches = self._step_terms(self.points, self.states), direct[len(self.qdd) :]
+        pushes = {key: Vector(wrenches[6 * at : 6 * at + 6]) for at, key in enumerate(on)}
+        terms = dataclasses.replace(self.terms, force=pushes)
+        done, rates, sent = reduce(trace, right.__getitem__, moves=False, loads=False, terms=terms)
         pushed: Twists = {}
         found = expand(trace, done, rates, (ZERO, ZERO), alpha=pushed)
         solved = {item.index[0]: cut(item.value) for item in found if item.array == "out"}

@@ -18,7 +18,7 @@ from ...errors import UnsupportedError
 from ...trace.emission import Store
 from ...trace.scalars import Value, less, select
 from ...trace.spatial import total
-from ..articulated_sweeps import expand, reduce
+from ..articulated_sweeps import StepTerms, expand, reduce
 from ..coordinates import integrate_link
 from ..model.links import Link, place_link
 from ..step.phases import StepPhases
@@ -53,7 +53,7 @@ class ClosedStep(Step):
         self.after: tuple[Columns, Columns] = {}, {}  # q', qd'
 
     def _accelerations(self, tau: Callable[[int], Value]) -> Columns:
-        swept = self.loops.sweep(tau, moves=True, loads=True)
+        swept = self.loops.sweep(tau, moves=True, loads=True, terms=StepTerms(self._with_resistance))
         self.margins += swept.margins
         return self.loops.outward_accelerations(swept, self.trace.base_acceleration)
 
@@ -115,9 +115,8 @@ class MultiplierStep(Step):
 
     def system(self) -> list[Store]:
         """out, right, size: what the multipliers solve."""
-        self.trace.with_step_armature = self._with_resistance
-        tau = self.trace.vector("tau")
-        return loop_system(self.trace, lambda dof: tau(dof) + self.forces[dof])
+        tau, terms = self.trace.vector("tau"), StepTerms(self._with_resistance)
+        return loop_system(self.trace, lambda dof: tau(dof) + self.forces[dof], terms)
 
     def _with_resistance(self, link: Link) -> Link:
         stiff = super()._with_resistance(link)
@@ -129,10 +128,10 @@ class MultiplierStep(Step):
         return stiff
 
     def _accelerations(self, tau: Callable[[int], Value]) -> Columns:
-        trace = self.trace
+        trace, terms = self.trace, StepTerms(self._with_resistance)
         place_links(trace, moves=True)
         loads = combine_rows(trace, trace.vector("multipliers"))
-        done, rates, _ = reduce(trace, lambda dof: tau(dof) + loads.get(dof, 0.0), moves=True, loads=True)
+        done, rates, _ = reduce(trace, lambda dof: tau(dof) + loads.get(dof, 0.0), moves=True, loads=True, terms=terms)
         return {item.index[0]: item.value for item in expand(trace, done, rates, trace.base_acceleration)}
 
     def _rank_loss(self) -> Value:

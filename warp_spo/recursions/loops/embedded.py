@@ -15,6 +15,7 @@ from ...trace.scalars import Value
 from ...trace.spatial import Articulated, Vector, total
 from .. import articulated, newton_euler
 from ..articulated import HERE, NO_INERTIA
+from ..articulated_sweeps import NO_TERMS, StepTerms
 from ..model.links import Link
 from . import clusters as aggregates
 from .closures import Closure, CouplingConstraint, closures
@@ -103,6 +104,7 @@ class ClosedLoops:
         loads: bool,
         wrenches: dict[int, Vector] | None = None,
         allowed: Allowed | None = None,
+        terms: StepTerms = NO_TERMS,
     ) -> Swept:
         """Sweep inward, node by node, a cluster being one node; return the factors and reduced forces.
 
@@ -111,6 +113,7 @@ class ClosedLoops:
             loads: subtract the wrenches body_f. wrenches: further (n; f) by link, in its frame.
             allowed: motions of a cluster; None: an orthonormal basis of what its constraints allow, and the shortest
                 accelerations that its velocities demand.
+            terms: what a time step adds to the links' armature; contacts are not for closed loops.
         """
         swept = Swept({}, {}, {}, {}, {}, [])
         own: dict[int, Articulated] = {}  # of the links in clusters
@@ -134,7 +137,7 @@ class ClosedLoops:
             if cluster is None:
                 through = [(self.trace.places[child].pose, swept.links[child].P) for child in apart]
                 through += [(HERE, inner[other]) for other in bundles]
-                inner[key], forces[key] = self._reduce(link, carried, through, force, swept, tau)
+                inner[key], forces[key] = self._reduce(link, carried, through, force, swept, tau, terms)
                 continue
             own[key], z[key] = NO_INERTIA if link.inertia is None else link.inertia.articulated, force
             for inertia in carried:
@@ -142,7 +145,7 @@ class ClosedLoops:
             waiting[id(cluster)] -= 1
             if waiting[id(cluster)] == 0:
                 space, k = self._shortest(cluster, swept, moves) if allowed is None else allowed(cluster)
-                found = self._eliminate(cluster, space, k, swept, own, z, tau)
+                found = self._eliminate(cluster, space, k, swept, own, z, tau, terms)
                 inner[id(cluster)], forces[id(cluster)] = found
         return swept
 
@@ -154,11 +157,18 @@ class ClosedLoops:
         return force if wrench is None else force - wrench
 
     def _reduce(
-        self, link: Link, carried: list[Articulated], through: list, force: Vector, swept: Swept, tau: Callable
+        self,
+        link: Link,
+        carried: list[Articulated],
+        through: list,
+        force: Vector,
+        swept: Swept,
+        tau: Callable,
+        terms: StepTerms,
     ) -> tuple[Articulated, Vector]:
         """Eliminate a link that is in no cluster; return P+ and z+ in its parent's frame."""
         key, place, move = id(link), self.trace.places[id(link)], self.trace.motions[id(link)]
-        stiff = self.trace.with_step_armature(link)
+        stiff = terms.with_armature(link)
         swept.links[key] = done = articulated.factor(stiff, place, carried, through, self.trace.epsilon)
         self.trace.label(link, "z")
         right = [tau(dof) for dof in link.dofs]
@@ -177,24 +187,25 @@ class ClosedLoops:
         )
 
     def _eliminate(
-        self, cluster: Cluster, space: NullSpace | Basis, k: Columns, swept: Swept, own: dict, z: dict, tau: Callable
+        self,
+        cluster: Cluster,
+        space: NullSpace | Basis,
+        k: Columns,
+        swept: Swept,
+        own: dict,
+        z: dict,
+        tau: Callable,
+        terms: StepTerms,
     ) -> tuple[Articulated, Vector]:
         key = id(cluster)
         swept.demanded[key] = k
         self.label(cluster, "D")
         swept.clusters[key] = done = aggregates.factor(
-            cluster, space, self.trace.places, own, self.trace.epsilon, self.trace.with_step_armature
+            cluster, space, self.trace.places, own, self.trace.epsilon, terms.with_armature
         )
         self.label(cluster, "z")
-        t, force = aggregates.hinge_forces(
-            cluster,
-            self.trace.places,
-            self.trace.motions,
-            own,
-            z,
-            lambda dof: k.get(dof, 0.0),
-            self.trace.with_step_armature,
-        )
+        rate, places, motions = (lambda dof: k.get(dof, 0.0)), self.trace.places, self.trace.motions
+        t, force = aggregates.hinge_forces(cluster, places, motions, own, z, rate, terms.with_armature)
         eps = [done.lost_pivot + total(x * (tau(dof) - t[dof]) for dof, x in column.items()) for column in done.X]
         swept.cluster_rates[key] = rates = done.solve(eps)
         for column, rate in zip(done.U, rates, strict=True):

@@ -20,6 +20,7 @@ from ...trace.emission import Store
 from ...trace.scalars import Scalar, Value, cut, is_constant, ordered
 from ...trace.spatial import ZERO, total
 from .. import newton_euler
+from ..articulated_sweeps import NO_TERMS, StepTerms
 from ..derivatives import adjoints
 from ..derivatives.adjoints import TreeEquations, gradient_stores, rates_along
 from ..derivatives.power import Entry, Gradients, Power
@@ -46,9 +47,9 @@ class ClosedEquations(TreeEquations):
         super().__init__(trace)
         self.loops, self.fixed = ClosedLoops(trace, embedding), fixed
 
-    def solve(self, right: Entry) -> Columns:
-        """Return X (X* Mass X)^-1 X* ``right``, by dof."""
-        swept = self.loops.sweep(right, moves=False, loads=False)
+    def solve(self, right: Entry, terms: StepTerms = NO_TERMS) -> Columns:
+        """Return X (X* Mass X)^-1 X* ``right``, by dof; Mass with what a time step adds to it, ``terms``."""
+        swept = self.loops.sweep(right, moves=False, loads=False, terms=terms)
         return self.loops.outward_accelerations(swept, (ZERO, ZERO))
 
     def gradient(self, solved: Columns, qdd: Entry, tau: Entry, right: Entry) -> Gradients:

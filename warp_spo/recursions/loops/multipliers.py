@@ -13,7 +13,7 @@ from ...trace.emission import Store
 from ...trace.scalars import Value
 from ...trace.spatial import ZERO, Vector, total
 from .. import articulated
-from ..articulated_sweeps import expand, mirror, pivots, reduce, weighted_products
+from ..articulated_sweeps import NO_TERMS, StepTerms, expand, mirror, pivots, reduce, weighted_products
 from ..motion import STILL
 from .closures import closures, count_open_rows
 from .clusters import Columns
@@ -30,10 +30,10 @@ def constraint_rows(trace: Trace) -> list[Columns]:
     return [{dof: x for dof, x in row.items() if not (x.__class__ is float and x == 0.0)} for row in found]
 
 
-def loop_system(trace: Trace, tau: Callable[[int], Value] | None = None) -> list[Store]:
+def loop_system(trace: Trace, tau: Callable[[int], Value] | None = None, terms: StepTerms = NO_TERMS) -> list[Store]:
     """out [row, row] = Y Mass^-1 Y*; right [row] = Y qdd(0) + Y' qd; size [row]; for ``tau`` or the array"""
     moves = "qd" in trace.inputs
-    done, rates, _ = reduce(trace, tau or trace.vector("tau"), moves, loads=True)
+    done, rates, _ = reduce(trace, tau or trace.vector("tau"), moves, loads=True, terms=terms)
     open_ = {item.index[0]: item.value for item in expand(trace, done, rates, trace.base_acceleration)}
     qd = trace.vector("qd") if moves else None
     trace.graph.step = "loops|g"

@@ -12,7 +12,7 @@ from typing import Any
 
 from ...trace.emission import Store
 from ...trace.scalars import Value
-from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Vector, cross
+from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross
 from .. import motion, newton_euler
 from ..motion import STILL, VelocityTerms
 from .exchange import Exchange, WholeTree
@@ -35,9 +35,6 @@ class Trace:
     Attributes:
         places: by id of the link: its placement. motions: its velocity terms. axes: its axes in the inertial frame.
         compensates_gravity: external wrenches hold up the bodies' ``gravcomp``, as forces of the hinges do.
-        with_step_armature: returns a link with what a time step adds to its armature.
-        contact_inertia, contact_force: by id of the link: what contacts add to its articulated inertia, and to the
-            forces on it; of a segment also for the link that it moves on.
         substitutes: entries that take the place of those of an array, by its name.
         team: of a segment, the pairs of bodies that native code couples between its sweeps. couples: what it stores for
             each couple of bodies that touches, and the entry that says so; kept_between_sweeps: values that both sweeps
@@ -47,8 +44,6 @@ class Trace:
     def __init__(self, links: Links, dtype: str, inputs: tuple[str, ...], exchange: Exchange | None = None):
         self.links, self.graph, self.epsilon, self.inputs = links, links.graph, EPSILON[dtype], inputs
         self.exchange = WholeTree(links) if exchange is None else exchange
-        self.contact_inertia: dict[int, Articulated] = {}
-        self.contact_force: dict[int, Vector] = {}
         self.substitutes: dict[str, Callable[[int], Value]] = {}
         self.team: Any = None
         self.couples: list[tuple[int, list[Store]]] = []
@@ -57,7 +52,6 @@ class Trace:
         self.motions: dict[int, VelocityTerms] = {}
         self.axes: dict[int, Matrix] = {}
         self.compensates_gravity = False
-        self.with_step_armature: Callable[[Link], Link] = lambda link: link
         self.bodies: dict[int, list[int]] = {}  # by link: the bodies whose centre of mass is on it
         for body in links.placements:
             link = links.carrier(body)

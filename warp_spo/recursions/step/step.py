@@ -19,7 +19,7 @@ from ...status import Status
 from ...trace.emission import Store
 from ...trace.scalars import Value, alone, floor, less, reciprocal, select
 from ...trace.spatial import total
-from ..articulated_sweeps import expand, reduce
+from ..articulated_sweeps import StepTerms, expand, reduce
 from ..coordinates import integrate_link
 from ..kinematics import body_states
 from ..model.links import Link
@@ -67,7 +67,6 @@ class Step:
     def stores(self, qdd: bool, status: bool) -> StepPhases:
         """Return the stores out = qd', q_out = q'; with ``qdd`` qdd_out = (qd' - qd) / h; with ``status`` that word."""
         trace = self.trace
-        trace.with_step_armature = self._with_resistance
         tau = trace.vector("tau")
         found = self._accelerations(lambda dof: tau(dof) + self.forces[dof])
         gains = {dof: self.h * value for dof, value in found.items()}
@@ -102,7 +101,8 @@ class Step:
         """Return qdd by dof for ``tau``, with the resistances of the active pieces added to Mass."""
         if self._uses_joint_space:
             return self._in_joint_space(tau)
-        done, rates, sent = reduce(self.trace, tau, moves=True, loads=True, phases=self.phases)
+        terms = StepTerms(self._with_resistance)
+        done, rates, sent = reduce(self.trace, tau, moves=True, loads=True, phases=self.phases, terms=terms)
         stores = sent + expand(self.trace, done, rates, self.trace.base_acceleration)
         self.messages = [item for item in stores if item.array != "out"]
         return {item.index[0]: item.value for item in stores if item.array == "out"}
