@@ -201,10 +201,7 @@ def model_steps(solver: str) -> Callable[[str, int, float, wp.Device], Stepper]:
 
 GROUPS: dict[str, tuple[tuple[str, ...], dict[str, tuple[Callable[..., Stepper], int]]]] = {
     "file": (FILES, {"warp_spo": (file_spo, 1), "mujoco_warp": (file_mujoco_warp, 1)}),
-    "model": (
-        MODELS,
-        {name: (model_steps(name), 2) for name in (*OWN, *PEERS)},
-    ),
+    "model": (MODELS, {name: (model_steps(name), 2) for name in (*OWN, *PEERS)}),
 }
 """Robots, and the makers of steps with how many steps one call takes."""
 

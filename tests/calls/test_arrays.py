@@ -173,11 +173,7 @@ REFUSED = {
     "list": (lambda: dict(x=VALUES.tolist()), TypeError, "copy: x is of type list; expected a torch tensor"),
     "number": (lambda: dict(x=1.0), TypeError, "x is of type float"),
     "none": (lambda: dict(x=None), TypeError, "x is of type NoneType"),
-    "shape": (
-        lambda: dict(x=VALUES.T),
-        ValueError,
-        r"NumPy array \(4, 3\); expected \(3, 4\) \[world, dof\]",
-    ),
+    "shape": (lambda: dict(x=VALUES.T), ValueError, r"NumPy array \(4, 3\); expected \(3, 4\) \[world, dof\]"),
     "one world": (
         lambda: dict(x=VALUES[0]),
         ValueError,

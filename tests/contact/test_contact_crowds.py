@@ -140,8 +140,7 @@ def two_limbs(kind, **axes):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "axes"),
-    [("ball", {}), ("d6", dict(linear=[(1, 0, 0)], angular=[(0, 0.6, 0.8), (0, -0.8, 0.6)]))],
+    ("kind", "axes"), [("ball", {}), ("d6", dict(linear=[(1, 0, 0)], angular=[(0, 0.6, 0.8), (0, -0.8, 0.6)]))]
 )
 def test_limbs_of_one_make(monkeypatch, device, kind, axes):
     """Limbs whose numbers differ share a text, and take the step of the whole tree."""

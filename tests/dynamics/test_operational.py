@@ -53,11 +53,7 @@ OPERATIONS = {
     "quasi_velocity_force": (("tau",), lambda s: (s.dof_count,), lambda d, a: quasi.dense_force(d, a["tau"])),
     "quasi_velocity_coriolis": (("nu",), lambda s: (s.dof_count,), lambda d, a: quasi.dense_coriolis(d, a["nu"])),
     "log_det_mass_matrix_gradient": ((), lambda s: (s.dof_count,), lambda d, a: d.log_det_gradient),
-    "mass_matrix_packed": (
-        (),
-        lambda s: (len(pattern(s)[0]),),
-        lambda d, a: d.mass_matrix[pattern(d.scene)],
-    ),
+    "mass_matrix_packed": ((), lambda s: (len(pattern(s)[0]),), lambda d, a: d.mass_matrix[pattern(d.scene)]),
     "mass_matrix_inverse_packed": (
         (),
         lambda s: (len(trees(s)[0]),),

@@ -29,11 +29,7 @@ def regressor(dense, a):
 # name -> (arrays that it takes, shape of the result, the reference's value for one world)
 OPERATIONS = {
     "frame_poses": (("q",), lambda s: (2, 7), lambda d, a: d.frame_poses(laws.frames_of(d.scene))),
-    "frame_velocities": (
-        ("q", "qd"),
-        lambda s: (2, 6),
-        lambda d, a: d.jacobian(laws.frames_of(d.scene)) @ a["qd"],
-    ),
+    "frame_velocities": (("q", "qd"), lambda s: (2, 6), lambda d, a: d.jacobian(laws.frames_of(d.scene)) @ a["qd"]),
     "frame_accelerations": (
         ("q", "qd", "qdd"),
         lambda s: (2, 6),
@@ -49,11 +45,7 @@ OPERATIONS = {
         lambda s: (s.coord_count,),
         lambda d, a: d.integrate(d.difference(a["q1"]), a["s"]),
     ),
-    "inverse_dynamics_regressor": (
-        ("q", "qd", "qdd"),
-        lambda s: (s.dof_count, 10 * s.body_count),
-        regressor,
-    ),
+    "inverse_dynamics_regressor": (("q", "qd", "qdd"), lambda s: (s.dof_count, 10 * s.body_count), regressor),
     "inverse_dynamics_regressor_product": (
         ("q", "qd", "qdd", "parameters"),
         lambda s: (s.dof_count,),

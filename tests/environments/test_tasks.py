@@ -11,13 +11,7 @@ pytest.importorskip("rsl_rl")
 import warp_spo as spo  # noqa: E402
 from warp_spo import env as envs  # noqa: E402
 from warp_spo import play, train  # noqa: E402
-from warp_spo.env import (  # noqa: E402
-    evaluation,
-    learning,
-    observations,
-    robots,
-    training_log,
-)
+from warp_spo.env import evaluation, learning, observations, robots, training_log  # noqa: E402
 from warp_spo.env.tasks import TASKS, go2_flat, go2_rough, task, velocity  # noqa: E402
 from warp_spo.viewing import Camera, Primitive, films  # noqa: E402
 from warp_spo.viewing.renderer import Renderer  # noqa: E402

@@ -125,10 +125,7 @@ def test_without_names_the_usual_operations_are_tuned(device, times, monkeypatch
     assert list(made(device).tune()) == list(tuning.USUAL)
 
 
-@pytest.mark.parametrize(
-    "change",
-    ["driver", "warp", "worlds", "dtype", "value", "variable", "device", "loops"],
-)
+@pytest.mark.parametrize("change", ["driver", "warp", "worlds", "dtype", "value", "variable", "device", "loops"])
 def test_another_key_measures_anew(change, device, times, monkeypatch):
     scene, options = zoo.fork(), {}
     made(device).tune(NAME)

@@ -143,11 +143,7 @@ REFUSED = {
     "block by name": (lambda: chain_of_two().resolvent().block("a", 0), ValueError, "block: i is 'a'; expected a node"),
     "negative power": (lambda: chain_of_two().power(-1), ValueError, "exponent is -1; expected an integer, 0 or more"),
     "block": (lambda: chain_of_two().resolvent().block(0, 2), ValueError, "j is 2; expected a node, 0 to 1"),
-    "x size": (
-        lambda: chain_of_two() @ ones(3, 4),
-        ValueError,
-        r"BWA.apply: x .*\(3, 4\); expected \(any, 5\)",
-    ),
+    "x size": (lambda: chain_of_two() @ ones(3, 4), ValueError, r"BWA.apply: x .*\(3, 4\); expected \(any, 5\)"),
     "x worlds": (
         lambda: BWA(Tree([-1, 0]), [None, ones(3, 1, 1)]) @ ones(4, 2, 1),
         ValueError,

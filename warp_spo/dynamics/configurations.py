@@ -14,10 +14,7 @@ from .trial_inputs import rotations
 if TYPE_CHECKING:
     from .dynamics import Dynamics
 
-ENDS = (
-    Argument("q0", "world, coordinate", sample="q"),
-    Argument("q1", "world, coordinate", sample="q_after"),
-)
+ENDS = (Argument("q0", "world, coordinate", sample="q"), Argument("q1", "world, coordinate", sample="q_after"))
 
 DIFFERENCE = Operation(
     "difference",

@@ -113,10 +113,7 @@ SOLVE_MASS_MATRIX = Operation(
     embed=Routine("embedded_solve_mass_matrix", minimal.solve_mass_matrix),
     multipliers=AS_WRITTEN,
     derivative=Derivative(
-        Routine("solve_mass_matrix_vjp", adjoints.solve_mass_matrix_vjp),
-        by=("q", "b"),
-        reads="qdd",
-        pull=_pull_columns,
+        Routine("solve_mass_matrix_vjp", adjoints.solve_mass_matrix_vjp), by=("q", "b"), reads="qdd", pull=_pull_columns
     ),
     trial=Trial(
         lambda dense, q, b: np.linalg.solve(dense.mass_matrix, b),

@@ -136,11 +136,7 @@ BIAS_FORCE = Operation(
 
 @BIAS_FORCE.method
 def bias_force(
-    self: Dynamics,
-    q: ArrayT,
-    qd: AnyArray | None = None,
-    body_f: AnyArray | None = None,
-    out: ArrayT | None = None,
+    self: Dynamics, q: ArrayT, qd: AnyArray | None = None, body_f: AnyArray | None = None, out: ArrayT | None = None
 ) -> ArrayT:
     """Compute :meth:`inverse_dynamics` with qdd = 0: velocity terms, gravity and external wrenches [world, dof]."""
     return self._engine.run(BIAS_FORCE, out, q=q, qd=qd, body_f=body_f)
@@ -274,12 +270,7 @@ BODY_REACTIONS = Operation(
 
 @BODY_REACTIONS.method
 def body_reactions(
-    self: Dynamics,
-    q: ArrayT,
-    qd: AnyArray,
-    qdd: AnyArray,
-    body_f: AnyArray | None = None,
-    out: ArrayT | None = None,
+    self: Dynamics, q: ArrayT, qd: AnyArray, qdd: AnyArray, body_f: AnyArray | None = None, out: ArrayT | None = None
 ) -> ArrayT:
     """Compute the wrench that each body receives through its hinge: force [N], then moment about its CoM [N m].
 

@@ -283,9 +283,7 @@ FRAME_ACCELERATIONS = Operation(
         multipliers=AS_WRITTEN,
         state=("q", "qd", "qdd"),
     ),
-    trial=Trial(
-        lambda dense, q, qd, qdd, frames: dense.jacobian(frames) @ qdd + dense.jacobian_bias(qd, frames),
-    ),
+    trial=Trial(lambda dense, q, qd, qdd, frames: dense.jacobian(frames) @ qdd + dense.jacobian_bias(qd, frames)),
 )
 
 

@@ -30,11 +30,7 @@ INVERSE_DYNAMICS_REGRESSOR = Operation(
 
 @INVERSE_DYNAMICS_REGRESSOR.method
 def inverse_dynamics_regressor(
-    self: Dynamics,
-    q: ArrayT,
-    qd: AnyArray | None = None,
-    qdd: AnyArray | None = None,
-    out: ArrayT | None = None,
+    self: Dynamics, q: ArrayT, qd: AnyArray | None = None, qdd: AnyArray | None = None, out: ArrayT | None = None
 ) -> ArrayT:
     """Compute Y of tau = Y parameters + armature qdd, the forces of :meth:`inverse_dynamics`, gravity included.
 
@@ -108,12 +104,7 @@ INVERSE_DYNAMICS_REGRESSOR_TRANSPOSED_PRODUCT = Operation(
 
 @INVERSE_DYNAMICS_REGRESSOR_TRANSPOSED_PRODUCT.method
 def inverse_dynamics_regressor_transposed_product(
-    self: Dynamics,
-    q: ArrayT,
-    qd: AnyArray | None,
-    qdd: AnyArray | None,
-    tau: AnyArray,
-    out: ArrayT | None = None,
+    self: Dynamics, q: ArrayT, qd: AnyArray | None, qdd: AnyArray | None, tau: AnyArray, out: ArrayT | None = None
 ) -> ArrayT:
     """Compute Y* tau for Y of :meth:`inverse_dynamics_regressor`, without Y: the gradient of ``tau* Y parameters``.
 

@@ -75,11 +75,7 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
 
 
 def _coupled_step(
-    builder: Builder,
-    layout: KernelLayout,
-    couples: couple_points.Couples,
-    parts: list[str],
-    entries: dict[str, int],
+    builder: Builder, layout: KernelLayout, couples: couple_points.Couples, parts: list[str], entries: dict[str, int]
 ) -> tuple[KernelLayout, str, str]:
     """Return the layout and the code, for CUDA and for the CPU, of a step in which aggregates couple bodies.
 

@@ -98,11 +98,7 @@ def root_force(
 
 
 def inverse_dynamics(
-    trace: Trace,
-    gravity: bool = True,
-    qdd: Callable[[int], Value] | None = None,
-    letter: str = "z",
-    moves: bool = True,
+    trace: Trace, gravity: bool = True, qdd: Callable[[int], Value] | None = None, letter: str = "z", moves: bool = True
 ) -> list[Store]:
     """out = Mass qdd + bias_force, for ``qdd`` or the array of that name; without velocity terms if not ``moves``"""
     base = trace.base_acceleration if gravity else (ZERO, ZERO)

@@ -461,16 +461,7 @@ class EllipsoidShape(HullShape):
 
 SHAPES: Mapping[str, type[ContactShape]] = {
     shape.kind: shape
-    for shape in (
-        PointShape,
-        SphereShape,
-        CapsuleShape,
-        BoxShape,
-        CylinderShape,
-        ConeShape,
-        EllipsoidShape,
-        HullShape,
-    )
+    for shape in (PointShape, SphereShape, CapsuleShape, BoxShape, CylinderShape, ConeShape, EllipsoidShape, HullShape)
 }
 """All kinds of shapes, by name."""
 

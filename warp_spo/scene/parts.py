@@ -105,18 +105,7 @@ class Body(StoredPart):
         object.__setattr__(self, "inertia", read_only(checked_inertia(call, inertia, self.any_inertia)))
 
 
-CLOSING = (
-    "fixed",
-    "revolute",
-    "prismatic",
-    "helical",
-    "universal",
-    "cylindrical",
-    "ball",
-    "planar",
-    "free",
-    "d6",
-)
+CLOSING = ("fixed", "revolute", "prismatic", "helical", "universal", "cylindrical", "ball", "planar", "free", "d6")
 """Kinds of hinges that a loop can close with."""
 KINDS = (*CLOSING, *(name for name in BY_NAME if name not in CLOSING))
 """Kinds of hinges beside "custom", which :meth:`Hinge.custom` makes."""

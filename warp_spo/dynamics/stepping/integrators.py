@@ -182,12 +182,7 @@ def several_launches(dyn: Dynamics, integrator: str, acts: bool, delays: bool, p
 
 
 def _step_under_multipliers(
-    dyn: Dynamics,
-    q_out: wp.array,
-    qd_out: wp.array,
-    asked: dict[str, wp.array],
-    option: dict[str, bool],
-    **given: Any,
+    dyn: Dynamics, q_out: wp.array, qd_out: wp.array, asked: dict[str, wp.array], option: dict[str, bool], **given: Any
 ) -> None:
     """Solve for the multipliers, step the open tree under them, and project its state onto the closures."""
     closures, launch = dyn._closures, dyn._engine.launch_routine
@@ -219,12 +214,7 @@ def midpoint(dyn: Dynamics, call: Call, interval: StepArrays, **forces: Any) -> 
 
 
 def rk4(
-    dyn: Dynamics,
-    call: Call,
-    interval: StepArrays,
-    tau: wp.array | None,
-    body_f: wp.array | None,
-    **targets: Any,
+    dyn: Dynamics, call: Call, interval: StepArrays, tau: wp.array | None, body_f: wp.array | None, **targets: Any
 ) -> None:
     """Launch the classical Runge-Kutta rule in the coordinates; quaternions are normalised at the end."""
     q, qd, q_out, qd_out, dt = interval

@@ -347,13 +347,7 @@ INTEGRATE = Operation(
     routine=integrators.INTEGRATE,
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,
-    derivative=Derivative(
-        INTEGRATE_VJP,
-        by=("q", "qd"),
-        values=KINEMATIC,
-        embed=AS_WRITTEN,
-        multipliers=AS_WRITTEN,
-    ),
+    derivative=Derivative(INTEGRATE_VJP, by=("q", "qd"), values=KINEMATIC, embed=AS_WRITTEN, multipliers=AS_WRITTEN),
     trial=Trial(lambda dense, q, qd, dt: dense.integrate(qd, dt), main=True),
 )
 

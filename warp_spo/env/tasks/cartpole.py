@@ -54,13 +54,7 @@ def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env
         decimation=4,
         default_q=robot.q,
         actions=actions.Control(clip=(-1.0, 1.0)),
-        observations={
-            "actor": [
-                lambda w: w.q[0],
-                angle,
-                Observation(observations.joint_velocity(), scale=0.3),
-            ]
-        },
+        observations={"actor": [lambda w: w.q[0], angle, Observation(observations.joint_velocity(), scale=0.3)]},
         rewards={"upright": (1.0, upright), "balance": (2.0, balance), "effort": (-0.02, effort)},
         terminations={"end of the rail": lambda w: abs(w.q[0]) > RAIL},
         events=[

@@ -61,10 +61,7 @@ def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env
             "foot slip": (-0.2, rewards.foot_slip(FEET)),
             "landing": (-1e-3, rewards.landing_force(FEET)),
         },
-        terminations={
-            "fell over": terminations.tilted(np.radians(60.0)),
-            "too low": terminations.below(0.45),
-        },
+        terminations={"fell over": terminations.tilted(np.radians(60.0)), "too low": terminations.below(0.45)},
         events=[*velocity.starts(), *velocity.randomisation("torso_link")],
         episode_length_s=20.0,
         **options,

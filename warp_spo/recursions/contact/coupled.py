@@ -57,9 +57,7 @@ class CoupledStep(ContactStepTrace):
         found = super().stores(qdd, status)
         reported = [item for name in self.reports for item in self._report_stores(name)]
         return found._replace(
-            prologue=found.prologue + self.first,
-            sweep=found.sweep + self.twists,
-            epilogue=found.epilogue + reported,
+            prologue=found.prologue + self.first, sweep=found.sweep + self.twists, epilogue=found.epilogue + reported
         )
 
     def inward(self, terms: StepTerms, tau: Callable[[int], Value]) -> tuple[Factors, dict, list[Store]]:

@@ -185,9 +185,7 @@ class PairedStep(ground.ContactStepTrace):
         found = super().stores(qdd, status)
         reported = [item for name in self.reports for item in self._report_stores(name)]
         return found._replace(
-            prologue=found.prologue + self.first,
-            sweep=self.response + found.sweep,
-            epilogue=found.epilogue + reported,
+            prologue=found.prologue + self.first, sweep=self.response + found.sweep, epilogue=found.epilogue + reported
         )
 
     def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, tuple[Vector, Vector]]) -> dict[int, Value]:

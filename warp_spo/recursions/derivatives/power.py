@@ -92,12 +92,7 @@ class Power:
     """
 
     def __init__(
-        self,
-        trace: Trace,
-        multiplier: Entry,
-        qdd: Entry,
-        base: tuple[Vector, Vector] | None = None,
-        moves: bool = True,
+        self, trace: Trace, multiplier: Entry, qdd: Entry, base: tuple[Vector, Vector] | None = None, moves: bool = True
     ):
         self.trace, self.gradients, self.stores = trace, Gradients(), list[Store]()
         self.forces: dict[int, Value] = {}
