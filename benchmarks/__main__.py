@@ -47,9 +47,7 @@ def parser() -> argparse.ArgumentParser:
         "--compare", nargs=2, metavar=("A", "B"), help="print the differences of two runs, JSON files; or measure two "
         "commits in turns, in the cases that FILTER matches. A commit may be a folder that git archive has filled"
     )  # fmt: skip
-    p.add_argument(
-        "--rounds", type=int, default=commits.ROUNDS, metavar="N", help="processes of each commit to compare"
-    )
+    p.add_argument("--rounds", type=int, default=commits.ROUNDS, metavar="N", help="processes a commit")
     p.add_argument(
         "--readme",
         nargs="?",

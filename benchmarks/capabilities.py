@@ -197,9 +197,7 @@ def operational(worlds: int, device: wp.Device) -> Iterator[tuple[str, Callable[
         peer.prepare("forward_dynamics", "", states, worlds)
         mjw, m, d, nv = peer.mjw, peer.model, peer.data, peer.host.nv
         owners = [at for at, link in enumerate(peer.robot.links) for _ in range(6 if link.kind == "free" else 1)]
-        bodies = [
-            1 + owners[place] for place, dof in enumerate(peer.robot.dofs) if "ankle_roll" in scene.dof_labels[dof]
-        ]
+        bodies = [1 + owners[at] for at, dof in enumerate(peer.robot.dofs) if "ankle_roll" in scene.dof_labels[dof]]
         assert len(bodies) == 2, f"G1 has {len(bodies)} feet; expected 2"
         J = [[wp.zeros((worlds, 3, nv), dtype=wp.float32, device=device) for _ in range(2)] for _ in bodies]
         x = wp.empty((worlds, nv), dtype=wp.float32, device=device)

@@ -176,11 +176,7 @@ def picture(rows: list[dict]) -> Any:
     from matplotlib.lines import Line2D
 
     pyplot = charts.load_pyplot("--write")
-    rows = [
-        row
-        for row in rows
-        if row.get("family") in FAMILIES and (row["dtype"] == "float64" or "Newton" in row["family"])
-    ]
+    rows = [r for r in rows if r.get("family") in FAMILIES and (r["dtype"] == "float64" or "Newton" in r["family"])]
     figure, axes = pyplot.subplots(figsize=(9.6, 6.0), layout="constrained")
     times = [1e3 * row["ms"] / row["worlds"] for row in rows]
     charts.log_axis(axes.xaxis, times, charts.time_text)

@@ -215,9 +215,7 @@ def warp_rows(scene: spo.Scene, options: argparse.Namespace, device: wp.Device) 
         Row("step, out=", lambda: dyn.step(q, qd, tau, dt, out=ahead), step),
         Row("step", lambda: dyn.step(q, qd, tau, dt), step),
     ]
-    return [
-        row._replace(name=f"Warp: {row.name}") for row in [*rows, solver_row(options.scene, options.worlds, device)]
-    ]
+    return [r._replace(name=f"Warp: {r.name}") for r in [*rows, solver_row(options.scene, options.worlds, device)]]
 
 
 def solver_row(name: str, worlds: int, device: wp.Device) -> Row:

@@ -25,9 +25,8 @@ autodoc_member_order = "bysource"
 nitpicky = True  # a reference to nothing is a warning
 smartquotes = False  # primes are derivatives
 napoleon_use_rtype = False
-napoleon_custom_sections = [
-    ("Attributes", "params_style")
-]  # a list within the entry of the class, several names a line
+# a list within the entry of the class, several names a line
+napoleon_custom_sections = [("Attributes", "params_style")]
 python_maximum_signature_line_length = 100
 
 html_theme = "pydata_sphinx_theme"

@@ -125,11 +125,7 @@ def stairs() -> Iterator[Row]:
         stiff = spo.Contact(0, box=(0.1, 0.1, 0.1), friction=0.1, stiffness=1e5)  # 1.5 sqrt(m / k) in a wall of 2 cm
         corners = free_body([stiff], field)
         q = np.array(
-            [
-                [-0.3, y, 0.0995, 0.0, 0.0, np.sin(0.5 * a), np.cos(0.5 * a)]
-                for a in (0.0, 0.2, 0.7)
-                for y in (0.0, 0.03)
-            ]
+            [[-0.3, y, 0.0995, 0.0, 0.0, np.sin(0.5 * a), np.cos(0.5 * a)] for a in (0, 0.2, 0.7) for y in (0.0, 0.03)]
         )
         qd = np.array([[1.5, 0.0, 0.0, 0.0, 0.0, 0.0]] * len(q))
         found = run(spo.Dynamics(corners, len(q), dtype="float64"), q, qd, dt, 1.0)

@@ -148,9 +148,7 @@ def main(arguments: list[str] | None = None) -> int:
     for name, worlds, passes in runs:
         label = f"{name}, {worlds} worlds" + (f", {passes} passes" if passes else "")
         results[label] = found = measure(name, worlds, device, passes)
-        figures = (
-            f"{key} {format(value, '.3g') if isinstance(value, float) else value}" for key, value in found.items()
-        )
+        figures = (f"{key} {format(x, '.3g') if isinstance(x, float) else x}" for key, x in found.items())
         print(label, "  ".join(figures), flush=True)
         if options.json:
             options.json.write_text(json.dumps(results, indent=1))

@@ -128,9 +128,7 @@ def main(arguments: list[str] | None = None) -> int:
                         max(total.get(key, -np.inf), value) if key == "worst rise" else total.get(key, 0) + value
                     )
             rows[f"{name}, {passes} passes"] = total
-            print(
-                f"{name}, {passes} passes:", ", ".join(f"{key} {value:.6g}" for key, value in total.items()), flush=True
-            )
+            print(f"{name}, {passes} passes:", ", ".join(f"{key} {x:.6g}" for key, x in total.items()), flush=True)
             if options.json:
                 options.json.write_text(json.dumps(rows, indent=1) + "\n")
     return 0

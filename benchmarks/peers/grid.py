@@ -122,9 +122,7 @@ def main() -> None:
     for name in options.scenes:
         build(options.folder, name, lump(SCENES[name]()), options.arch)
         print(options.folder / f"grid_{name}", file=sys.stderr)
-    python = Path(shutil.which("grid-generate") or "").with_name(
-        "python"
-    )  # GRiD may be installed in another environment
+    python = Path(shutil.which("grid-generate") or "").with_name("python")  # GRiD may be in another environment
     code = "from importlib.metadata import version; print(version('grid-rbd'))"
     (options.folder / "grid.version").write_text(subprocess.check_output([python, "-c", code], text=True))
 

@@ -156,9 +156,8 @@ def check_outboard_cancellation(where: Setting) -> None:
     qdd, status = run(geared, where)
     wanted = Sweep(geared.scene, geared.q, "extended").forward(geared.tau).astype(np.float64)
     error = (np.linalg.norm(qdd - wanted, axis=1) / np.linalg.norm(wanted, axis=1)).max()
-    assert not status.any() and error <= 1e3 * where.eps, (
-        f"status {status}, error {error:.1e}"
-    )  # the arm's .33 over the armature 2^-7 is 42; S1
+    # the arm's .33 over the armature 2^-7 is 42; S1
+    assert not status.any() and error <= 1e3 * where.eps, f"status {status}, error {error:.1e}"
 
 
 def check_half_of_the_digits_lost(where: Setting) -> None:

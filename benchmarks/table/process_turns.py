@@ -124,9 +124,7 @@ def _next(workers: dict[Connection, _Worker], taken: int, rest: Sequence[Any]) -
     return pipe if after <= taken or (len(wanting) == len(workers) and not rest) else None
 
 
-def _heard(
-    workers: dict[Connection, _Worker], pipe: Connection, rest: collections.deque[Any]
-) -> Iterator[tuple[Any, Any]]:
+def _heard(workers: dict[Connection, _Worker], pipe: Connection, rest: collections.deque) -> Iterator[tuple[Any, Any]]:
     """Read what a process says, and give it the next task if it is done with one."""
     worker = workers[pipe]
     task = worker.task

@@ -102,9 +102,7 @@ def test_committed_tables_are_those_of_the_committed_runs():
 
 def test_committed_page_of_limits_is_that_of_its_newest_run():
     folder = evidence.RESULTS / "speed"
-    file = max(
-        (file for file in folder.glob("*.json") if "reference_us" in file.read_text()), key=lambda file: file.name
-    )
+    file = max((file for file in folder.glob("*.json") if "reference_us" in file.read_text()), key=lambda f: f.name)
     page = limits.page(file)
     assert (folder / "README.md").read_text() == page, f"python -m benchmarks.speed --table {file.name} prints it anew"
     run, lines = json.loads(file.read_text()), {str(line.call): line for line in limits.LINES}

@@ -58,9 +58,7 @@ def test_folders_stand_for_commits(monkeypatch, capsys, tmp_path):
         (Path(name) / "warp_spo" / "__init__.py").touch()
     times = {Path(name): us for name, us in zip(names, (10.0, 20.0), strict=True)}
     monkeypatch.setattr(commits, "git", None)
-    monkeypatch.setattr(
-        commits, "measure", lambda root, chosen, device: [case | dict(us=times[root]) for case in chosen]
-    )
+    monkeypatch.setattr(commits, "measure", lambda root, chosen, device: [one | dict(us=times[root]) for one in chosen])
     options = ["panda.step", "--device", "cpu", "--worlds", "64"]
     assert main([*options, "--compare", *names, "--rounds", "2"]) == 1
     assert "panda.step.w64: 10 to 20 us, +100.0%" in capsys.readouterr().out

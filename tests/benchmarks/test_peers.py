@@ -101,9 +101,7 @@ def test_mujoco_has_the_same_robot(robot, op):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(
-            name, marks=pytest.mark.slow if name == "newton" else ()
-        )  # its own kernels take a minute to compile
+        pytest.param(name, marks=pytest.mark.slow if name == "newton" else ())  # compiles for a minute
         for name in peers.PEERS
         if name not in ("mujoco", "pinocchio", "grid")
     ],

@@ -72,9 +72,7 @@ CASES = [
 
 @pytest.mark.parametrize(
     ("kind", "case"),
-    slow_unless(
-        [*(("torch", case) for case in CASES), ("warp", CASES[0])], itertools.product(["torch", "warp"], CASES)
-    ),
+    slow_unless([*(("torch", x) for x in CASES), ("warp", CASES[0])], itertools.product(["torch", "warp"], CASES)),
     ids=str,
 )
 def test_every_operation_repeated_is_itself(kind, case, device):

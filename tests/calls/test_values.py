@@ -21,9 +21,7 @@ from warp_spo.reference import dense as reference
 QUICK = {*((name, "warp") for name in NAMES if name != "body_gravcomp")}  # that has tests of its own
 QUICK |= {("body_mass", kind) for kind in KINDS}
 NAMES_IN_KINDS = [  # a quick run sets names from Warp arrays, and one name from all kinds
-    pytest.param(name, kind, marks=() if (name, kind) in QUICK else pytest.mark.slow)
-    for name in NAMES
-    for kind in KINDS
+    pytest.param(name, k, marks=() if (name, k) in QUICK else pytest.mark.slow) for name in NAMES for k in KINDS
 ]
 
 

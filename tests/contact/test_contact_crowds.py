@@ -52,9 +52,7 @@ def run(monkeypatch, device, scene, always, dtype, steps, worlds=256):
         q, qd = (x.astype(dtype) for x in thrown(scene, worlds))
         count, found = len(scene.contact_points), []
         for _ in range(steps):
-            more = {
-                name: np.full((worlds, count, size)[: 2 + (size > 1)], np.nan, dtype) for name, size in REPORTS.items()
-            }
+            more = {name: np.full((worlds, count, n)[: 2 + (n > 1)], np.nan, dtype) for name, n in REPORTS.items()}
             more |= {"contact_excess": np.full((worlds, 3), np.nan, dtype), "status": np.full(worlds, -1, np.int32)}
             q, qd = dyn.step(q, qd, None, 5e-3, **bundled(**more))
             found.append({"q": q.copy(), "qd": qd.copy(), **more})

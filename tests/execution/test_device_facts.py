@@ -76,9 +76,7 @@ def test_float64_has_room_for_as_many_scalars_as_float32(kilobytes, room, monkey
 def test_rows_that_a_block_may_not_declare_are_asked_for(bodies, asked, monkeypatch):
     kernels, make = [], native.kernel
     monkeypatch.setattr("warp_spo.dynamics.dynamics.read_facts", lambda device: MEASURED)
-    monkeypatch.setattr(
-        native, "kernel", lambda *given, **more: kernels.append((more, given[1])) or make(*given, **more)
-    )
+    monkeypatch.setattr(native, "kernel", lambda *a, **more: kernels.append((more, a[1])) or make(*a, **more))
     dyn = spo.Dynamics(zoo.planar_chain(bodies), 2, "cpu", dtype="float64", granularity="tree")
     x = np.zeros((2, 6 * bodies))
     dyn.operators(np.zeros((2, bodies))).phi.apply(x)

@@ -35,9 +35,7 @@ def test_segments_are_chains(name):
         for over, link in zip(segment.links, segment.links[1:], strict=False):
             assert link.parent is over and len(over.children) == 1
         assert len(segment.children) != 1 and len(segment.children) == len(segment.links[-1].children)
-        assert all(
-            child.index > segment.index and child.links[0].parent is segment.links[-1] for child in segment.children
-        )
+        assert all(one.index > segment.index and one.links[0].parent is segment.links[-1] for one in segment.children)
     schedule = Schedule(segments)
     leaves = [schedule.assignments[segment.index].warp for segment in segments.leaves]
     assert sorted(leaves) == [*range(schedule.warps)]

@@ -88,9 +88,7 @@ def test_a_step_with_contacts_is_tuned_for_itself(monkeypatch, folder):
     scene = contact_cases.quadruped()
     dyn, times = made(wp.get_device("cpu"), scene), {"tree": 1.0, "segment": 2.0}
     dyn.plan = plan.choose(scene, WORLDS, MEASURED, "float32")
-    monkeypatch.setattr(
-        tuning, "_measure", lambda dyn, operation, routine, names: {name: times[name] for name in names}
-    )
+    monkeypatch.setattr(tuning, "_measure", lambda dyn, operation, routine, names: {one: times[one] for one in names})
     assert dyn.plan.of(CONTACT_STEP) == "segment"
     choice = dyn.tune("step")["step"]
     assert choice.granularity == "tree" and choice.us == {"segment": 2.0, "tree": 1.0}

@@ -9,10 +9,8 @@ import warp_spo as spo
 from support.flexible_scenes import Traced, about
 from support.flexible_twin import Twin, of_quaternion
 
-LAW = {
-    "float64": 5e-12,
-    "float32": 1e-6,
-}  # of one step, beside the largest entry; float32 measured 2.2e-7 with 20 modes
+# of one step, beside the largest entry; float32 measured 2.2e-7 with 20 modes
+LAW = {"float64": 5e-12, "float32": 1e-6}
 
 E, DENSITY, SIDE, LENGTHS = 4e8, 1000.0, 0.02, (1.0, 0.8)
 """A planar arm of two soft links under gravity: modulus [Pa], density [kg/m^3], side of the section and lengths [m]."""

@@ -44,9 +44,7 @@ def test_a_moment_rolls_a_beam_up():
 def test_the_circle_converges():
     """Second order in the number of bodies without foreshortening, fourth with it."""
     errors = {
-        stiffening: [
-            np.linalg.norm(rolled_up(count, stiffening=stiffening)[1]) * np.pi / 10.0 - 1.0 for count in (16, 32)
-        ]
+        stiffening: [np.linalg.norm(rolled_up(n, stiffening=stiffening)[1]) * np.pi / 10.0 - 1.0 for n in (16, 32)]
         for stiffening in (False, True)
     }
     orders = {stiffening: np.log2(coarse / fine) for stiffening, (coarse, fine) in errors.items()}

@@ -27,9 +27,7 @@ FINITE_DIFFERENCE = 1e-6  # eps / h + h^2
 
 def traced(name, operation):
     links = Links(SCENES[name]())
-    stores = sorted(
-        symbolic.function(operation)(Trace(links, "float64", ARRAYS[operation])), key=lambda item: item.index
-    )
+    stores = sorted(symbolic.function(operation)(Trace(links, "float64", ARRAYS[operation])), key=lambda s: s.index)
     outputs = [item.value for item in stores]
     inputs = [x for x in g.ordered(outputs) if x.op == "input"]
     rng = np.random.default_rng(0)

@@ -29,9 +29,7 @@ GRADIENTS = {
 }
 SLOW = ("solve_mass_matrix", "jacobian", "integrate")  # one mathematics with the others, kernels of their own
 OPTIONS = {"step": {"dt": 2e-3}, "integrate": {"dt": 0.1}, "jacobian": {"frames": [0, 1]}}
-DIFFERENCE = (
-    1e-6  # step of central differences in float64; their error is about the square of it, and 1e-10 of rounding
-)
+DIFFERENCE = 1e-6  # step of central differences in float64; their error is about its square, and 1e-10 of rounding
 DIFFERENCES = 2e-7
 enable_x64 = jax.enable_x64 if hasattr(jax, "enable_x64") else importlib.import_module("jax.experimental").enable_x64
 
@@ -87,9 +85,7 @@ def weights_of(result):
     return [rng.normal(size=x.shape) for x in (result if isinstance(result, tuple) else (result,))]
 
 
-@pytest.mark.parametrize(
-    "operation", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in GRADIENTS]
-)
+@pytest.mark.parametrize("operation", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in GRADIENTS])
 def test_under_jit_and_grad(operation):
     """The results are those of the method to the bit; gradients are torch's to the bit, and those of differences."""
     dyn, names = robot(), GRADIENTS[operation]

@@ -73,9 +73,7 @@ def test_rounds_are_logarithmic(depth, device, monkeypatch):
     A @ x
     launched = []
     launch = launches.launch
-    monkeypatch.setattr(
-        launches, "launch", lambda kernel, *rest, **more: launched.append(launch(kernel, *rest, **more))
-    )
+    monkeypatch.setattr(launches, "launch", lambda kernel, *a, **more: launched.append(launch(kernel, *a, **more)))
     A @ x
     assert len(launched) == max(1, 2 * int(np.ceil(np.log2(depth + 1))) - 1)
 

@@ -175,9 +175,7 @@ def test_blocks_are_products_of_weights_along_paths(scene, device):
         for k in range(len(s.dims)):
             nodes, product = path(s.graph, i, k), None
             if nodes:
-                product = functools.reduce(
-                    lambda w, node: one_world(s.weights[node]) @ w, nodes[:-1], np.eye(s.dims[k])
-                )
+                product = functools.reduce(lambda w, i: one_world(s.weights[i]) @ w, nodes[:-1], np.eye(s.dims[k]))
                 assert_close(A.block(i, k)[0], product)
             else:
                 assert not A.block(i, k).any()

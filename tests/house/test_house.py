@@ -52,9 +52,7 @@ ROOMS = (
 def imports_that_run(path):
     """Return all import statements of a file, except those that only type checkers read."""
     tree = ast.parse(path.read_text())
-    tree.body = [
-        node for node in tree.body if not (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
-    ]
+    tree.body = [one for one in tree.body if not (isinstance(one, ast.If) and ast.unparse(one.test) == "TYPE_CHECKING")]
     return [node for node in ast.walk(tree) if isinstance(node, (ast.Import, ast.ImportFrom))]
 
 
@@ -147,9 +145,7 @@ def rooms_imported(path):
         else:
             continue
         names = [full[0]] if full else [alias.name for alias in node.names]
-        found += [
-            (node.lineno, name) for name in names if (PACKAGE / name).is_dir() or (PACKAGE / f"{name}.py").exists()
-        ]
+        found += [(node.lineno, x) for x in names if (PACKAGE / x).is_dir() or (PACKAGE / f"{x}.py").exists()]
     return found
 
 

@@ -35,9 +35,7 @@ def test_mistakes_are_found(tmp_path):
         "len(spo.Status.OK.advice.severity)": '"str" has no attribute "severity"',
         "operator @ 3": "Unsupported operand types|No overload variant",
     }
-    lines = ["import warp_spo as spo", "def use(operator: spo.Operator) -> None:"] + [
-        f"    {line}" for line in mistakes
-    ]
+    lines = ["import warp_spo as spo", "def use(operator: spo.Operator) -> None:"] + [f"    {one}" for one in mistakes]
     (tmp_path / "user.py").write_text("\n".join(lines) + "\n")
     found = check(tmp_path / "user.py", tmp_path)
     for line, words in enumerate(mistakes.values(), start=3):

@@ -149,9 +149,7 @@ TRACED = {  # arrays, shape of one world, the reference
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "name", slow_unless([name for name in TRACED if name != "log_det_mass_matrix_gradient"], TRACED)
-)
+@pytest.mark.parametrize("name", slow_unless([n for n in TRACED if n != "log_det_mass_matrix_gradient"], TRACED))
 def test_every_trace_equals_the_dense_reference(name):
     scene = custom_hinges.skeleton(names=("rolling_knee", "ellipsoid_shoulder", "many_functions"))
     a, (given, shape, reference) = states(scene), TRACED[name]

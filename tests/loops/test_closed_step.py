@@ -30,9 +30,7 @@ def given(scene, s):
 
 def wanted(scene, how, s, a):
     closed = [mechanisms.Closed(scene, q) for q in s.q]
-    return [
-        implicit.closed_step(c, how.dofs, H, *(a[name][w] for name in ("qd", *FORCES))) for w, c in enumerate(closed)
-    ]
+    return [implicit.closed_step(c, how.dofs, H, *(a[n][w] for n in ("qd", *FORCES))) for w, c in enumerate(closed)]
 
 
 def missed(scene, how, a, right, **more):

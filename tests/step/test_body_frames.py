@@ -37,10 +37,7 @@ def scene_of(name):
     ("name", "variable"),
     [
         ("walker", ("body_mass", "body_com", "joint_armature")),
-        *(
-            pytest.param(name, (), marks=pytest.mark.slow)
-            for name in ("fork", "dancer", "screw_tree", "star", "forest")
-        ),
+        *(pytest.param(x, (), marks=pytest.mark.slow) for x in ("fork", "dancer", "screw_tree", "star", "forest")),
     ],
 )
 def test_equal_those_of_statements(name, variable, device):

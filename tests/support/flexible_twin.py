@@ -67,9 +67,7 @@ class FlexibleBody:
         mass, coupling = np.zeros((n, n)), np.zeros((6, n))
         if n and modes.points is not None:
             points = modes.points
-            self.masses, self.places, self.shapes = (
-                np.asarray(x) for x in (points.mass, points.position, points.shapes)
-            )
+            self.masses, self.places, self.shapes = map(np.asarray, (points.mass, points.position, points.shapes))
             self.bends = np.zeros((len(self.masses), 3, n, n)) if points.stiffening is None else points.stiffening
         own_mass, own_coupling, own_rigid = np.zeros((n, n)), np.zeros((6, n)), np.zeros((6, 6))
         for weight, place, shape in zip(self.masses, self.places, self.shapes, strict=True):

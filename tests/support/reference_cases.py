@@ -21,9 +21,7 @@ STENCIL = 3e-4  # of unit time: 1e-3 loses a factor 100 where accelerations reac
 
 every_scene = pytest.mark.parametrize("name", slow_unless(zoo.FEW, zoo.SCENES))
 is_screws = {name: all(h.kind not in ("ball", "free") for h in make().hinges) for name, make in zoo.SCENES.items()}
-is_floating = [
-    name for name, make in zoo.SCENES.items() if any(h.kind == "free" for h in make().hinges if h.parent < 0)
-]
+is_floating = [name for name, f in zoo.SCENES.items() if any(h.kind == "free" for h in f().hinges if h.parent < 0)]
 
 
 @functools.cache

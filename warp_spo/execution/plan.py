@@ -25,19 +25,13 @@ COLUMN_BYTES = 1 << 28  # workspace of a solve with many right-hand sides; more 
 # Measured on an H200, 2026-11-21; see CONTRIBUTING. Numbers of worlds and of threads are in proportion to its
 # multiprocessors on another GPU, see DeviceFacts.scaled.
 FEW_WORLDS = 32768  # so many leave a GPU waiting: a warp for each limb, and rows read where they are
-SHARED_CODE_WORLDS = (
-    40960  # up to so many, a warp for each limb is faster if limbs share code (Go2 on 58 multiprocessors)
-)
+SHARED_CODE_WORLDS = 40960  # up to so many, a warp for each limb is faster if limbs share code: Go2, 58 multiprocessors
 MOST_DOFS = 128  # straight-line code of more takes too long to compile
 SPILLS = {"float32": 32, "float64": 15}  # dofs at which one thread no longer holds a whole tree in registers,
 SOLVES = {"float32": 32, "float64": 20}  # and at which it does not without velocities
-LEAST_SHARED_CODE = {
-    "float32": 0.5,
-    "float64": 0.0,
-}  # share of limbs that share code; below it a thread a world is faster then
-SERIAL = (
-    0.75  # share of the links on one path from a root, beyond which limbs save less than they cost: an arm's fingers
-)
+# share of limbs that share code; below it a thread a world is faster then
+LEAST_SHARED_CODE = {"float32": 0.5, "float64": 0.0}
+SERIAL = 0.75  # share of the links on one path from a root, beyond which limbs cost more than they save, as fingers do
 HELD = 16  # dofs of which a thread holds the variable values, too
 SHORT_ROWS = 10  # dofs up to which a thread's own row is read as fast as through shared memory,
 LONG_ROWS = 24  # in segments; longer rows come in together already at fewer worlds

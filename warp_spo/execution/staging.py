@@ -72,9 +72,7 @@ def choose_layout(
         The first layout that fits into ``room``; if none does, the last one.
     """
     used = read_entries(everything)
-    rows = [
-        SharedRow(name, len(shape), math.prod(shape[1:])) for name, shape in shapes.items() if name in used and shape
-    ]
+    rows = [SharedRow(name, len(s), math.prod(s[1:])) for name, s in shapes.items() if name in used and s]
     numbers = tuple(name for name, shape in shapes.items() if (name in used or name == SUBSTEPS) and not shape)
     out = SharedRow("out", len(shapes["out"]), math.prod(shapes["out"][1:]))
     dense = sorted(item.index[0] for item in stores) == list(range(out.entries))

@@ -34,9 +34,7 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
     outs = [item for item in stores if item.array == "out"]
     looped = [item for item in stores if item.array in (*PASSED, coupled.TWIST)]
     aggregates = any(item.array == coupled.TWIST for item in stores)
-    kept = (
-        [Store("ahead", (), value) for value in phases.pass_invariants] if looped else []
-    )  # may read what no store needs
+    kept = [Store("ahead", (), x) for x in phases.pass_invariants] if looped else []  # may read what no store needs
     layout = builder.layout(job, outs, phases.prologue + stores + kept)
     once = routine.passes is not None or any(item.array in LOOPED for item in stores)  # may write over what it reads
     layout = layout._replace(retries=not once and not layout.staged and layout.result.way in (DIRECT, TILED, RELAYED))

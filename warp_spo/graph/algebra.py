@@ -348,9 +348,7 @@ def _with_columns(array: wp.array) -> wp.array:
 
 def _flatten(kind: type, operands: Sequence[Operator], name: str) -> tuple[Operator, ...]:
     """Return the operands, with those of type ``kind`` replaced by their parts in the attribute ``name``."""
-    return tuple(
-        part for operand in operands for part in (getattr(operand, name) if type(operand) is kind else (operand,))
-    )
+    return tuple(part for one in operands for part in (getattr(one, name) if type(one) is kind else (one,)))
 
 
 def common(what: str, operands: Sequence[Operator]) -> tuple[int, wp.Device, type, str | None]:

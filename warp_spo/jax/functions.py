@@ -198,9 +198,7 @@ class Function:
         found = {name: array for name, array in named if array is not None}
         given = {name for name, array in named if array is not None or name not in self.values}
         lacking = [name for name in self.arguments if self.is_needed(name) and name not in given]
-        written = [
-            name for name in ("out", *(one.name for one in self.operation.arrays if one.written)) if name in more
-        ]
+        written = [name for name in ("out", *(a.name for a in self.operation.arrays if a.written)) if name in more]
         if written:
             raise TypeError(f"{self.name}: {written[0]}= is given; JAX arrays cannot be written; use what it returns")
         wrong = (

@@ -39,9 +39,7 @@ class PairStep(ContactStep):
                 self.pair_of.append(number)
         n = dense.dof_count
         shapes = ((-1, 3, n), (-1, 3), *[(-1,)] * 6)
-        found = Points(
-            *(np.reshape([row[i] for row in rows], shape) for i, shape in enumerate(shapes)), np.zeros(len(rows))
-        )
+        found = Points(*(np.reshape([row[i] for row in rows], s) for i, s in enumerate(shapes)), np.zeros(len(rows)))
         return found if ground is None else Points(*(np.concatenate(both) for both in zip(ground, found, strict=True)))
 
     def reports(self, found):

@@ -436,9 +436,7 @@ class Call:
             wp.synchronize_stream(self.device.stream)  # copies made here are freed without regard to streams
         for array, warp_array in self._staged:
             array[...] = warp_array.numpy()
-        results = tuple(
-            self._to_kind_of_result(warp_array) if out is None else out for out, warp_array in self._results
-        )
+        results = tuple(self._to_kind_of_result(made) if out is None else out for out, made in self._results)
         self.result = results[0] if len(results) == 1 else results or None
 
     def _to_kind_of_result(self, array: wp.array) -> Any:

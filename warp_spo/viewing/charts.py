@@ -103,9 +103,7 @@ def svg(figure: Any) -> str:
     out = io.StringIO()
     with style():
         figure.savefig(out, format="svg", metadata={"Date": None})
-    text = re.sub(
-        r'(width|height)="([\d.]+)pt"', lambda size: f'{size[1]}="{float(size[2]) * 4 / 3:g}"', out.getvalue()
-    )
+    text = re.sub(r'(width|height)="([\d.]+)pt"', lambda m: f'{m[1]}="{float(m[2]) * 4 / 3:g}"', out.getvalue())
     return re.sub(r"\n\s+", "\n", text)
 
 

@@ -44,9 +44,7 @@ def backpropagate(
         launches.fill(array, 0)
     adjoint, still = MidpointAdjoint(dyn, dt, q, qd, results), dyn.recursions.array(("way back", "still"), *q.shape)
     launches.fill(still, 0)
-    last = adjoint.combine(
-        2.0, qd_cotangent, 0.0, qd_cotangent, adjoint.like(qd, "last")
-    )  # qd' = found + 2 (end - kick)
+    last = adjoint.combine(2.0, qd_cotangent, 0.0, qd_cotangent, adjoint.like(qd, "last"))  # of qd'
     adjoint.backpropagate_kick(end, last)
     adjoint.combine(1.0, adjoint.by_previous_rates, 1.0, qd_cotangent, adjoint.by_previous_rates)
     adjoint.combine(1.0, adjoint.by_previous_kick, -2.0, qd_cotangent, adjoint.by_previous_kick)

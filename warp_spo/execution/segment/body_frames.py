@@ -31,9 +31,7 @@ PLACE = 7
 FRAME = "frame"
 """The variables of a traversal: origin, quaternion, omega, velocity."""
 SIZE = 13
-BY_STATEMENTS = (
-    4  # dofs of unlike segments up to which bodies have statements of their own, which are fetched fast enough
-)
+BY_STATEMENTS = 4  # dofs of unlike segments up to which bodies have statements of their own: these are fetched fast
 
 
 class TraversalFrame(NamedTuple):

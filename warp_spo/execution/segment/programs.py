@@ -36,9 +36,7 @@ from .schedule import PARTS, Schedule
 from .warp_specialized import HELD, PassLoop, SegmentCode, WarpSpecializedKernel
 
 MOST_REGISTERS = 255  # of a thread
-MOST_LAWS = (
-    12  # dofs of unlike segments; with more, laws are found in loops, because their statements are fetched slowly
-)
+MOST_LAWS = 12  # dofs of unlike segments; with more, loops find the laws, because statements are fetched slowly
 BODIES = "bodies"  # option of a step by segments whose kernel writes the states of bodies, too
 
 
@@ -129,9 +127,7 @@ class _SegmentProgram:
         """Return what the work on a segment stores; the constants ``unfolded`` do not fold, see
         :mod:`.shared_constants`."""
         shapes, options = self.job.shapes, self.job.options
-        links = self.builder.own_links(
-            options, self.unfolds
-        )  # its own: segments of equal structure then give equal text
+        links = self.builder.own_links(options, self.unfolds)  # its own: equal segments then give equal text
         exchange = SegmentExchange(links, index, self.offsets, self.segments.distinct_dof_count > MOST_LAWS)
         trace = Trace(links, self.dtype, tuple(shapes), exchange)
         trace.team = self.couples
@@ -226,9 +222,7 @@ class _SegmentProgram:
 
         first, sweeps, ruling, checking = (emitter() for _ in range(4))
         later = emitter() if kernel.passes else sweeps
-        pass_invariants = first.region(
-            [*phases.prologue, *(Store(HELD, (at,), value) for at, value in enumerate(held))]
-        )
+        pass_invariants = first.region([*phases.prologue, *(Store(HELD, (at,), x) for at, x in enumerate(held))])
         sweeps.keep(HELD, held)
         if routine.is_counted:
             later.keep(HELD, held)  # other segments may have written over what these come from

@@ -220,9 +220,8 @@ class WarpSpecializedKernel:
         assert self.passes is not None
         leaves = [work for work in self._work.values() if not work.segment.children]
         inner = [work for work in self._work.values() if work.segment.children]
-        ranks: list[dict[int, SegmentCode]] = [
-            {leaf.assigned.warp: leaf for leaf in leaves}
-        ]  # by warp, one of its segments each
+        # by warp, one of its segments each
+        ranks: list[dict[int, SegmentCode]] = [{leaf.assigned.warp: leaf for leaf in leaves}]
         for work in inner:
             warp = work.assigned.warp
             free = next((rank for rank in ranks if warp not in rank), None)
@@ -349,9 +348,7 @@ class WarpSpecializedKernel:
 
     def _shared_sweeps(self, equal: Sequence[SegmentCode], prefix: str = "") -> tuple[str, str]:
         """Return one text for the inward and one for the outward sweeps of segments of equal structure."""
-        checks = (
-            [] if self._laws_in_loops else [list(each) for each in zip(*(work.checks for work in equal), strict=True)]
-        )
+        checks = [] if self._laws_in_loops else list(map(list, zip(*(work.checks for work in equal), strict=True)))
         regions = [[work.inward for work in equal], [work.outward for work in equal], *checks]
         regions += [list(each) for each in zip(*(work.couples for work in equal), strict=True)]
         who = choose(_warps(equal), range(len(equal)))

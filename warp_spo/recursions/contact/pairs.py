@@ -195,9 +195,7 @@ class PairedStep(ground.ContactStepTrace):
         seats = [frame_on_link(trace, *frame) for frame in frames]
         place_axes_of(trace, [link for link, _ in seats])
         before = velocities_of(trace, [link for link, _ in seats], self.qd)
-        self.first += [
-            Store(PLACE, (i,), value) for i, value in places_of(trace, range(-1, len(trace.links.scene.bodies)))
-        ]
+        self.first += [Store(PLACE, (i,), x) for i, x in places_of(trace, range(-1, len(trace.links.scene.bodies)))]
         self._begin_pairs(seats, before)
         forces = {id(link): NO_FORCE for link in trace.links.links}
         for number, (link, arm) in enumerate(seats):

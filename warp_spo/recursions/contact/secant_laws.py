@@ -152,6 +152,4 @@ def largest(values: list[Value]) -> Value:
 @cached_by_scene
 def single_dofs(scene: Scene) -> frozenset[int]:
     """Return the dofs of the hinges that have one."""
-    return frozenset(
-        int(first) for hinge, first in zip(scene.hinges, scene.qd_start, strict=False) if hinge.dof_count == 1
-    )
+    return frozenset(int(dof) for hinge, dof in zip(scene.hinges, scene.qd_start, strict=False) if hinge.dof_count == 1)

@@ -272,10 +272,8 @@ class ContactStepTrace(Step):
         found = finish_point(point, state, moved, self.h, self.pass_variables.closing)
         if point.near is not None:
             mask, left = point.works(found.left.candidate), found.left
-            values = (*found.force, *found.excess, left.across, left.closed)
-            *force, over, pulls, lacking, across, closed = (
-                branch(mask, x, 0.0, f"force at {point.number}") for x in values
-            )
+            values, name = (*found.force, *found.excess, left.across, left.closed), f"force at {point.number}"
+            *force, over, pulls, lacking, across, closed = (branch(mask, x, 0.0, name) for x in values)
             left = PointState(across, closed, left.candidate)
             found = PointResult(Vector(force), found.slip, over, pulls, lacking, left)
         for name in ("across", "candidate", "closed"):

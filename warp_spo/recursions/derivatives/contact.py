@@ -203,9 +203,7 @@ class PassSolve(PassAdjoint):
         results, seeds = self._results()
         stops = [*self.qdd.values(), *(x for key in on for part in self.moving[key] for x in part)]
         direct = _by_each(stops, reverse(results, _distinct(stops), seeds, True))
-        right = {
-            dof: gradient + self._of_later(COTANGENT, dof) for dof, gradient in zip(self.qdd, direct, strict=False)
-        }
+        right = {dof: x + self._of_later(COTANGENT, dof) for dof, x in zip(self.qdd, direct, strict=False)}
         self.terms, wrenches = self._step_terms(self.points, self.states), direct[len(self.qdd) :]
         pushes = {key: Vector(wrenches[6 * at : 6 * at + 6]) for at, key in enumerate(on)}
         terms = dataclasses.replace(self.terms, force=pushes)
@@ -238,9 +236,7 @@ class PassSolve(PassAdjoint):
             at = self.weighed.index(segment.index)
             carried = exchange.from_children(segment.links[-1], "P", self.inner, Articulated.unpacked)[0].packed
             gradients = _by_each(carried, reverse(results, _distinct(carried), seeds, True))
-            found += [
-                Store(f"{INERTIA}_out", (len(gradients) * at + i,), gradient) for i, gradient in enumerate(gradients)
-            ]
+            found += [Store(f"{INERTIA}_out", (len(gradients) * at + i,), x) for i, x in enumerate(gradients)]
             found += exchange.send("Q", segment, gradients)
         return found
 

@@ -90,12 +90,8 @@ class OnePass(ContactStepTrace):
         if not self.has_kicks:
             return ()
         segments = self.trace.exchange.segments
-        own = {
-            segment.index for segment in segments if any(self._weighs(link) for link in segment.links if link.is_leader)
-        }
-        chains = {
-            segment.index: {segment.index, *(further.index for further in segment.ancestors)} for segment in segments
-        }
+        own = {one.index for one in segments if any(self._weighs(link) for link in one.links if link.is_leader)}
+        chains = {one.index: {one.index, *(inner.index for inner in one.ancestors)} for one in segments}
         return tuple(segment.index for segment in segments if segment.children and own & chains[segment.index])
 
     def _weighs(self, link: Link) -> bool:

@@ -70,11 +70,7 @@ class ClosedStep(Step):
         return [s._replace(value=closed[s.array][s.index[0]]) if s.array in closed else s for s in stores]
 
     def _close(self, cluster: Cluster, q: Columns, qd: Columns) -> None:
-        count = (
-            1
-            if all(isinstance(constraint, CouplingConstraint) for _, constraint in cluster.constraints)
-            else NEWTON_STEPS
-        )
+        count = 1 if all(isinstance(one, CouplingConstraint) for _, one in cluster.constraints) else NEWTON_STEPS
         place = lambda: {id(link): place_link(link, q.__getitem__) for link in cluster.links}  # noqa: E731
         places = place()
         constrained = clusters.independent_rows(cluster, places, self.loops.embedding.rows, self.trace.epsilon)
@@ -104,9 +100,7 @@ class ClosedStep(Step):
 
     def _constraint_error(self) -> Value:
         q, qd = self.after
-        places = {
-            id(link): place_link(link, q.__getitem__) for cluster in self.loops.clusters for link in cluster.links
-        }
+        places = {id(link): place_link(link, q.__getitem__) for one in self.loops.clusters for link in one.links}
         return count_open_rows(self.loops.constraints, places, q.__getitem__, qd.__getitem__)
 
 

@@ -118,9 +118,7 @@ def inverse_dynamics(trace: Trace, embedding: Embedding) -> list[Store]:
     place_links(trace, "qd" in trace.inputs)
     X, qdd = columns_of_all(loops), accelerations(loops)
     tau = {item.index[0]: item.value for item in newton_euler.inverse_dynamics(trace, qdd=qdd.__getitem__)}
-    return [
-        Store("out", (i,), total(x * tau[dof] for dof, x in X[free].items())) for i, free in enumerate(embedding.dofs)
-    ]
+    return [Store("out", (at,), total(x * tau[i] for i, x in X[dof].items())) for at, dof in enumerate(embedding.dofs)]
 
 
 def log_det_mass_matrix(trace: Trace, embedding: Embedding) -> list[Store]:
@@ -217,9 +215,8 @@ def _products(loops: ClosedLoops, swept: Swept, columns: dict[int, dict[int, lis
     """out = Y* D Y, both triangles, of columns of Y = D^-1 [I - H psi K] ..."""
     D = {key: [pivot.D for pivot in done.pivots] for key, done in swept.links.items()}
     D |= {key: done.d for key, done in swept.clusters.items()}
-    lost_pivot = [done.lost_pivot for done in swept.links.values()] + [
-        done.lost_pivot for done in swept.clusters.values()
-    ]
+    lost_pivot = [done.lost_pivot for done in swept.links.values()]
+    lost_pivot += [done.lost_pivot for done in swept.clusters.values()]
     return mirror(weighted_products(loops.trace, D, total(lost_pivot), columns))
 
 

@@ -74,7 +74,5 @@ def project_velocity(trace: Trace, embedding: Embedding, fixed: tuple[int, ...] 
     step: Columns = {}
     for cluster in loops.clusters:
         constrained = loops.constrain(cluster, fixed)
-        step |= constrained.space.particular(
-            [-total(x * qd(dof) for dof, x in row.items()) for row in constrained.rows]
-        )
+        step |= constrained.space.particular([-total(x * qd(i) for i, x in row.items()) for row in constrained.rows])
     return [Store("out", (dof,), qd(dof) + step.get(dof, 0.0)) for dof in range(trace.links.scene.dof_count)]

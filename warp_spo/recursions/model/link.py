@@ -69,9 +69,8 @@ class Link:
     @property
     def is_leader(self) -> bool:
         """Whether work that a dof does once is done at this link, not at another one of its group."""
-        return (
-            self.shared_dofs is None or self.shared_dofs.links[0].hinge is self.hinge
-        )  # of a copy with other armature, too
+        # of a copy with other armature, too
+        return self.shared_dofs is None or self.shared_dofs.links[0].hinge is self.hinge
 
     @property
     def coupling_inertia(self) -> dict[tuple[int, int], float]:

@@ -107,9 +107,7 @@ class Segments:
     def distinct_dof_count(self) -> int:
         """Number of dofs in segments that are not alike, one of each kind counted; free hinges are left out."""
         kinds = {tuple(link.hinge.name for link in segment.links): segment for segment in self.all}
-        return sum(
-            len(link.dofs) for segment in kinds.values() for link in segment.links if not link.hinge.unconstrained
-        )
+        return sum(len(link.dofs) for one in kinds.values() for link in one.links if not link.hinge.unconstrained)
 
     @property
     def shared_code_fraction(self) -> float:

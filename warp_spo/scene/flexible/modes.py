@@ -390,8 +390,6 @@ def with_modes(hinge: Any, modes: Modes | None, defaults: Mapping[str, float]) -
     added = {name: np.full(modes.count, value) for name, value in defaults.items()}
     added |= {"stiffness": modes.stiffness, "damping": modes.damping, "rest": np.zeros(modes.count)}
     vars(found).update(vars(plain))
-    vars(found).update(
-        {name: read_only(np.concatenate([getattr(plain, name), values])) for name, values in added.items()}
-    )
+    vars(found).update({name: read_only(np.concatenate([getattr(plain, name), x])) for name, x in added.items()})
     vars(found).update(elements=(*plain.elements, ElementaryHinge(Amplitudes(modes.count))), without_modes=plain)
     return found
