@@ -323,6 +323,13 @@ def test_shapes_of_a_newton_model_are_where_newton_has_them():
         assert want - 1e-6 <= found[label] <= want + rim + 1e-6, label
 
 
+def test_a_newton_model_without_a_plane_has_no_floor():
+    model = newton_model(ground=lambda builder: None)
+    with pytest.warns(UserWarning, match=r"from_newton: left out: all contacts, because there is no plane"):
+        assert not spo.from_newton(model, contacts=True).contacts
+    assert spo.from_newton(model, contacts=True, ground=spo.Plane()).contacts
+
+
 def test_materials_of_a_newton_model_are_means_with_its_ground():
     """ke, kd, mu one to one; worlds may differ."""
     model = newton_model()

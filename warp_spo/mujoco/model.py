@@ -79,7 +79,8 @@ def scene_of(source: Source, floating: bool | None, selection: ShapeSelection = 
     except ValueError as error:  # of a body, a hinge or the scene, which know neither call nor file
         raise ValueError(f"{source.title}: {error}; correct the model") from None
     selection, disabled = selection.unless(source.disabled("CONTACT") or source.disabled("CONSTRAINT"))
-    scene, lost = selection.apply(source.title, scene, lambda: collision_shapes(source, moving_bodies(scene)))
+    shapes = lambda: collision_shapes(source, moving_bodies(scene))  # noqa: E731
+    scene, lost = selection.apply(source.title, scene, shapes, complete=True)
     source.left_out += disabled + lost
     _warn(source, selection.contacts is not None)
     return scene
@@ -151,7 +152,9 @@ def _warn(source: Source, touches: bool) -> None:
     if solid.size and not touches and not source.disabled("CONTACT") and not source.disabled("CONSTRAINT"):
         planes = [source.words("geom", int(geom)) for geom in solid if m.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE]
         among = f", {', '.join(planes)} among them" if planes else ""
-        way = "scene.with_contacts adds points that touch the ground, contacts=True takes these"
+        grounded = planes or np.any(m.geom_type[solid] == mujoco.mjtGeom.mjGEOM_HFIELD)
+        takes = "contacts=True takes these" if grounded else "contacts=True, ground=spo.Plane() take these and a floor"
+        way = f"scene.with_contacts adds points that touch the ground, {takes}"
         found.append(f"contacts of {solid.size} geom(s){among} ({way})")
     for mocap in np.flatnonzero(m.body_mocapid >= 0):
         found.append(f"the motion of mocap {source.words('body', int(mocap))}, which stands where the file puts it")

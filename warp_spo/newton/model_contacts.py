@@ -238,7 +238,7 @@ def model_contacts(
     """
     shapes = ModelShapes(model, worlds)
     seen = [shape for shape in shapes.first() if shape.index not in without]
-    selected = selection.resolve("from_newton", scene, seen, shapes.touches)
+    selected = selection.resolve("from_newton", scene, seen, shapes.touches, complete=True)
     ground: Any = selected.ground
     values: dict[str, np.ndarray] = {}
     if selected.ground_shape is not None:

@@ -31,6 +31,10 @@ UPRIGHT = 0.5  # least cosine between the normal of a ground and the upward dire
 STEEP = ", steeper than 60 degrees"  # what a ground is that is not UPRIGHT
 AXIS_TOLERANCE = 1e-6  # by which axes of a height field may differ from the inertial ones
 GROUNDS = ("plane", "height field")
+NO_GROUND = (
+    "all contacts, because there is no plane and no height field to touch (ground=spo.Plane() adds a floor; a pattern, "
+    "such as contacts='*', takes the plane z = 0)"
+)
 MATERIAL = ("friction", "stiffness", "damping")
 KINDS = tuple(kind for kind, shape in SHAPES.items() if shape.names)
 """Kinds of shapes of sources that contacts can represent."""
@@ -117,7 +121,8 @@ class ShapeSelection(NamedTuple):
 
     Attributes:
         contacts: None: none. True, a pattern, several, or points by pattern.
-        ground: None: that of the source, or the plane at height zero.
+        ground: None: that of the source, or the plane at height zero; with contacts=True a source that is ``complete``
+            has no ground but its own.
         points: of a hull at most.
     """
 
@@ -132,6 +137,7 @@ class ShapeSelection(NamedTuple):
         shapes: Callable[[], Sequence[CollisionShape]],
         touches: CollisionFilter | None = None,
         material_rule: MaterialRule = CollisionShape.with_mean_material,
+        complete: bool = False,
     ) -> tuple[Scene, list[str]]:
         """Return the scene with contacts for the chosen shapes, and in words what is left out, such as "box 'table'".
 
@@ -139,6 +145,7 @@ class ShapeSelection(NamedTuple):
             call: for errors. shapes: returns those of the source; called only if some are wanted.
             touches: says whether a shape collides with the ground of the source; None: each of ``shapes`` does.
             material_rule: returns a shape with its material on the ground of the source; None: another ground.
+            complete: the source describes a whole world, as a MuJoCo or a Newton model does, not a robot alone.
 
         Raises:
             ValueError: a pattern matches no shape of a body that can move, a number of points is invalid, or there is a
@@ -147,7 +154,7 @@ class ShapeSelection(NamedTuple):
         """
         if not self.wants(call):
             return scene, []
-        found = self.resolve(call, scene, shapes(), touches, material_rule)
+        found = self.resolve(call, scene, shapes(), touches, material_rule, complete)
         return scene.with_contacts(
             [one for _, made in found.contacts_by_shape for one in made], found.ground
         ), found.left_out
@@ -174,6 +181,7 @@ class ShapeSelection(NamedTuple):
         shapes: Sequence[CollisionShape],
         touches: CollisionFilter | None = None,
         material_rule: MaterialRule = CollisionShape.with_mean_material,
+        complete: bool = False,
     ) -> SelectedContacts:
         """Return the contacts of the chosen shapes, and what is left out; arguments and errors as :meth:`apply`."""
         moving = moving_bodies(scene)
@@ -188,6 +196,9 @@ class ShapeSelection(NamedTuple):
         words = [shape.words(scene.body_labels) for shape in left_out]
         steep = STEEP if ground_shape is not None else f"{STEEP}, so that the ground is the plane z = 0"
         words += [shape.words(scene.body_labels) + (steep if shape.kind in GROUNDS else "") for shape in others]
+        if complete and self.contacts is True and ground is None and not any(shape.kind in GROUNDS for shape in others):
+            words += [NO_GROUND] if selected else []
+            selected = []
         return SelectedContacts(
             [(shape, contacts_of(material_rule(shape, ground_shape), most)) for shape, most in selected],
             ground,
