@@ -8,12 +8,14 @@ without a joint has a fixed hinge.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from ..scene.parts import IDENTITY_POSE, UNLIMITED, Body, Hinge
+from .joint_limits import JointLimits
 from .source import Source
 
 FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{n}")) for n in ("FREE", "BALL", "SLIDE", "HINGE"))
@@ -128,6 +130,10 @@ class Mechanism:
         at = composed(at, (*(axis * ref), *UPRIGHT) if kind == SLIDE else (0.0, 0.0, 0.0, *turned_about(axis, ref)))
         return Hinge(KINDS[kind], parent, child, axis=axis, parent_pose=at, child_pose=back, **values)
 
+    @functools.cached_property
+    def _limits(self) -> JointLimits:
+        return JointLimits(self.source)
+
     def _dof_values(self, joint: int) -> dict[str, Any]:
         """Return armature, damping, friction, stiffness and limits of a joint, those of its actuator included."""
         m, source = self.source.model, self.source
@@ -146,7 +152,7 @@ class Mechanism:
             if lower > upper:
                 margin = f"a margin of {m.jnt_margin[joint]:g}, more than half of its range"
                 source.refuse(f"{source.words('joint', joint)}, which has {margin},", "make the margin smaller")
-            ke, kd = limit_gains(m.jnt_solref[joint], m.dof_invweight0[first])
+            ke, kd = self._limits.gains(joint, lower, upper)
             values |= {"limit_lower": lower, "limit_upper": upper, "limit_ke": ke, "limit_kd": kd}
         low, high = m.jnt_actfrcrange[joint]
         if m.jnt_actfrclimited[joint] and low == -high:
@@ -181,20 +187,6 @@ class Mechanism:
             self.hinges.append(Hinge("free", -1, body - 1, rest=pose, label=f"{own}_free"))
         else:
             self.hinges.append(Hinge("fixed", -1, body - 1, parent_pose=pose, label=f"{own}_fixed"))
-
-
-def limit_gains(solref: np.ndarray, inverse_inertia: float) -> tuple[float, float]:
-    """Return stiffness and damping of a joint limit.
-
-    MuJoCo's limits are soft accelerations. These are the spring and the damper that give the effective inertia of the
-    joint at qpos0, ``1 / dof_invweight0``, the time constant and the damping ratio of ``solreflimit``; numbers below
-    zero are stiffness and damping themselves, for a unit of inertia.
-    """
-    inertia = 1.0 / inverse_inertia if inverse_inertia > 0.0 else 1.0
-    first, second = (float(x) for x in solref)
-    if first <= 0.0 or second <= 0.0:
-        return -first * inertia, -second * inertia
-    return inertia / (first * second) ** 2, 2.0 * inertia / first
 
 
 def actuator_output(source: Source, actuator: int) -> int:

@@ -31,9 +31,9 @@ def from_mujoco(model: Any, contacts: Any = None, ground: Any = None, points: in
 
     Mass matrix, bias force and accelerations are MuJoCo's. ``ref`` is part of the anchors, so that q is qpos;
     ``joint_rest_q`` is ``qpos_spring``. Active equality constraints, soft in MuJoCo, become exact: connect and weld are
-    loops, a joint or tendon equality of first order between two joints is a coupling. A limited joint has limits; their
-    stiffness and damping give the joint's effective inertia at qpos0 the time constant and damping ratio of
-    ``solreflimit``. Actuators on scalar joints and fixed tendons are :class:`Actuator` in the model's order; their
+    loops, a joint or tendon equality of first order between two joints is a coupling. A limited joint has limits, whose
+    stiffness holds the limb where ``solreflimit`` and ``solimplimit`` do under its own weight; their damping ratio is
+    MuJoCo's. Actuators on scalar joints and fixed tendons are :class:`Actuator` in the model's order; their
     armature and damping belong to the joint. Named sites and keyframes keep their names, a keyframe without one is
     ``key_0``, ``key_1`` and so on by its place. ``gravcomp`` is part of ``passive_force`` and ``step``.
 

@@ -1,0 +1,141 @@
+"""Limits of MuJoCo's joints, as springs and dampers.
+
+MuJoCo's limits are soft in acceleration ("Computation", "Constraint model"). At depth r beyond a limit its force is
+
+    f = I d / (1 - d) (k d r + b r' + r''),    I = 1 / dof_invweight0,
+
+with stiffness k and damping b from ``solreflimit``, and the impedance d(r), between 0 and 1, from ``solimplimit``. A
+limb of that inertia moves by r'' = -k d^2 r - b d r' + (1 - d) load / I. Hence it rests where a spring of stiffness
+I k d^2 / (1 - d) would hold it, and it comes to rest with the damping ratio b / (2 sqrt(k)).
+
+A scene's limit is one spring and one damper. They are those of d at the depth where the limb rests in MuJoCo under its
+own weight: K = I k d^2 / (1 - d), and D = I b d / sqrt(1 - d), which has the same damping ratio. The weight is that at
+the bound, all other joints at qpos0. Where it pushes against both bounds, the depth is the geometric mean of both.
+Where it pushes against neither, as on a vertical axis, the load is the limb's weight at its lever.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+
+from .source import Source
+
+MINVAL, LEAST, MOST = 1e-15, 1e-4, 0.9999  # mjMINVAL, mjMINIMP, mjMAXIMP of MuJoCo
+DEFAULT_SOLREF = (0.02, 1.0)  # what MuJoCo takes for a solref of mixed signs
+DEPTHS = np.logspace(-15.0, 3.0, 721)  # [rad or m], among which the depth at rest is looked for
+HALVINGS = 20  # of an interval of DEPTHS, which is 6 % of its depth
+EARTH = np.array([0.0, 0.0, -9.81])  # [m/s^2], where the model has no gravity
+ROUNDING = 1e-9  # share of a limb's weight, or of its radius of gyration, below which a push or a lever is none
+
+OfDepth = Callable[[np.ndarray], np.ndarray]
+
+
+def limit_reference(solref: np.ndarray, most: float, least_time: float = 0.0) -> tuple[float, float]:
+    """Return MuJoCo's stiffness k [1/s^2] and damping b [1/s] of a constraint.
+
+    Args:
+        solref: time constant and damping ratio if both are positive; else -k and -b before they are scaled.
+        most: the largest impedance, ``solimp[1]``. least_time: of a time constant [s], two steps under "refsafe".
+    """
+    most = float(np.clip(most, LEAST, MOST))
+    first, second = (float(x) for x in (DEFAULT_SOLREF if (solref[0] > 0.0) != (solref[1] > 0.0) else solref))
+    if first <= 0.0:
+        return -first / most**2, -second / most
+    time = max(first, least_time)
+    return 1.0 / max(MINVAL, (most * time * second) ** 2), 2.0 / max(MINVAL, most * time)
+
+
+def impedance(solimp: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Return MuJoCo's impedance d of a constraint at depths [rad or m]."""
+    first, last, middle = np.clip(solimp[[0, 1, 3]], LEAST, MOST)
+    width, power = max(float(solimp[2]), 0.0), max(float(solimp[4]), 1.0)
+    if width <= MINVAL or first == last:
+        return np.full(np.shape(depth), 0.5 * (first + last))
+    x = np.minimum(depth / width, 1.0)
+    low, high = middle * (x / middle) ** power, 1.0 - (1.0 - middle) * ((1.0 - x) / (1.0 - middle)) ** power
+    return first + (last - first) * np.where(x <= middle, low, high)
+
+
+def rest_depth(stiffness: OfDepth, load: OfDepth) -> float:
+    """Return the least depth at which stiffness times depth carries the load, both functions of the depth."""
+    carried = np.flatnonzero(stiffness(DEPTHS) * DEPTHS >= load(DEPTHS))
+    if not carried.size or not carried[0]:
+        return float(DEPTHS[carried[0] if carried.size else -1])
+    low, high = DEPTHS[carried[0] - 1 : carried[0] + 1]
+    for _ in range(HALVINGS):
+        middle = np.array([0.5 * (low + high)])
+        low, high = (low, middle[0]) if stiffness(middle) * middle >= load(middle) else (middle[0], high)
+    return float(high)
+
+
+class JointLimits:
+    """Springs and dampers of the limits of a model's hinges and slides.
+
+    A limb is all that a joint carries. Its weight is that of the model's gravity, less ``gravcomp``, or that on Earth
+    in a model without gravity.
+    """
+
+    def __init__(self, source: Source):
+        m = source.model
+        self._model, self._data = m, mujoco.MjData(m)
+        mujoco.mj_kinematics(m, self._data)
+        self._gravity = EARTH if source.disabled("GRAVITY") or not m.opt.gravity.any() else np.array(m.opt.gravity)
+        self._least_time = 0.0 if source.disabled("REFSAFE") else 2.0 * m.opt.timestep
+        masses = m.body_mass * (1.0 - m.body_gravcomp)
+        self._mass, self._moment = masses.copy(), masses[:, None] * self._data.xipos  # of limbs [kg], [kg m]
+        for body in range(m.nbody - 1, 0, -1):
+            self._mass[m.body_parentid[body]] += self._mass[body]
+            self._moment[m.body_parentid[body]] += self._moment[body]
+
+    def gains(self, joint: int, lower: float, upper: float) -> tuple[float, float]:
+        """Return the stiffness and the damping of a joint's limits, which are at ``lower`` and ``upper``."""
+        m = self._model
+        solimp, inverse = np.array(m.jnt_solimp[joint]), float(m.dof_invweight0[m.jnt_dofadr[joint]])
+        inertia = 1.0 / inverse if inverse > 0.0 else 1.0
+        k, b = limit_reference(m.jnt_solref[joint], solimp[1], self._least_time)
+
+        def stiffness(depth: np.ndarray) -> np.ndarray:
+            d = impedance(solimp, depth)
+            return inertia * k * d**2 / (1.0 - d)
+
+        whole = self._weight(joint, inertia)
+        loads: list[OfDepth] = [
+            load
+            for load in (lambda r: -self._push(joint, lower - r), lambda r: self._push(joint, upper + r))
+            if load(np.zeros(1))[0] > ROUNDING * whole
+        ] or [lambda r: np.full(r.shape, whole)]
+        depth = np.exp(np.mean([np.log(rest_depth(stiffness, load)) for load in loads], keepdims=True))
+        d = float(impedance(solimp, depth)[0])
+        return float(stiffness(depth)[0]), inertia * b * d / float(np.sqrt(1.0 - d))
+
+    def _weight(self, joint: int, inertia: float) -> float:
+        """Return the weight of a joint's limb [N], of a hinge times its lever [N m].
+
+        The lever is the distance of the limb's centre of mass from the axis, or its radius of gyration if that is zero.
+        """
+        mass = abs(self._mass[self._model.jnt_bodyid[joint]])
+        force = mass * float(np.linalg.norm(self._gravity))
+        if self._model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
+            return force
+        lever = float(np.linalg.norm(np.cross(self._data.xaxis[joint], self._arm(joint))))
+        gyration = float(np.sqrt(inertia / max(mass, MINVAL)))
+        return force * (lever if lever > ROUNDING * gyration else gyration)
+
+    def _push(self, joint: int, positions: np.ndarray) -> np.ndarray:
+        """Return the generalised force of the limb's weight on a joint at positions [N m or N]."""
+        axis, force = self._data.xaxis[joint], self._mass[self._model.jnt_bodyid[joint]] * self._gravity
+        if self._model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
+            return np.full(positions.shape, axis @ force)
+        angles = positions - self._model.qpos0[self._model.jnt_qposadr[joint]]
+        across = self._arm(joint) - axis * (axis @ self._arm(joint))
+        now, turned = (axis @ np.cross(arm, force) for arm in (across, np.cross(axis, across)))
+        return now * np.cos(angles) + turned * np.sin(angles)
+
+    def _arm(self, joint: int) -> np.ndarray:
+        """Return the centre of mass of a joint's limb, from the joint's anchor [m], inertial axes."""
+        body = self._model.jnt_bodyid[joint]
+        mass = self._mass[body]
+        return self._moment[body] / mass - self._data.xanchor[joint] if mass else np.zeros(3)
