@@ -26,7 +26,7 @@ from .source import Source
 MINVAL, LEAST, MOST = 1e-15, 1e-4, 0.9999  # mjMINVAL, mjMINIMP, mjMAXIMP of MuJoCo
 DEFAULT_SOLREF = (0.02, 1.0)  # what MuJoCo takes for a solref of mixed signs
 DEPTHS = np.logspace(-15.0, 3.0, 721)  # [rad or m], among which the depth at rest is looked for
-HALVINGS = 20  # of an interval of DEPTHS, which is 6 % of its depth
+ROUNDS, PARTS = 3, 100  # intervals of DEPTHS are 6 % of the depth; each round looks into a hundredth of one
 EARTH = np.array([0.0, 0.0, -9.81])  # [m/s^2], where the model has no gravity
 ROUNDING = 1e-9  # share of a limb's weight, or of its radius of gyration, below which a push or a lever is none
 
@@ -61,14 +61,13 @@ def impedance(solimp: np.ndarray, depth: np.ndarray) -> np.ndarray:
 
 def rest_depth(stiffness: OfDepth, load: OfDepth) -> float:
     """Return the least depth at which stiffness times depth carries the load, both functions of the depth."""
-    carried = np.flatnonzero(stiffness(DEPTHS) * DEPTHS >= load(DEPTHS))
-    if not carried.size or not carried[0]:
-        return float(DEPTHS[carried[0] if carried.size else -1])
-    low, high = DEPTHS[carried[0] - 1 : carried[0] + 1]
-    for _ in range(HALVINGS):
-        middle = np.array([0.5 * (low + high)])
-        low, high = (low, middle[0]) if stiffness(middle) * middle >= load(middle) else (middle[0], high)
-    return float(high)
+    depths = DEPTHS
+    for _ in range(ROUNDS):
+        carried = np.flatnonzero(stiffness(depths) * depths >= load(depths))
+        if not carried.size or not carried[0]:
+            return float(depths[carried[0] if carried.size else -1])
+        depths = np.linspace(depths[carried[0] - 1], depths[carried[0]], PARTS)
+    return float(depths.mean())
 
 
 class JointLimits:
