@@ -192,3 +192,42 @@ def test_friction_is_mujocos(floor, tmp_path):
     wanted, found = mujocos_contacts(file), {c.label: c.friction for c in spo.load(file, contacts=True).contacts}
     assert len(found) == 7 and len(set(found.values())) > 2
     assert found == pytest.approx(wanted)
+
+
+SOFT = """<mujoco><option {option}/><worldbody><geom name="floor" type="plane" size="1 1 1" {floor}/>
+ <body name="b"><freejoint/><geom name="plain" size="0.1"/><geom name="slow" size="0.1" solref="0.05 1"/>
+ <geom name="hard" size="0.1" solimp="0.99 0.99 0.01" solref="-100 -5"/><geom name="first" size="0.1" priority="2"/>
+ <geom name="paired" size="0.1" solref="0.1 1"/></body></worldbody>
+ <contact><pair geom1="floor" geom2="paired" {pair}/></contact></mujoco>"""
+
+
+@pytest.mark.parametrize("floor", ["", 'solref="0.03 1"', 'priority="1" solimp="0.8 0.8 0.01"'])
+@pytest.mark.parametrize("more", ["", 'solimp="0.5 0.6 0.01"', 'solreffriction="0.04 1"'])
+def test_softness_that_is_not_mujocos_default_is_said_to_be_left_out(floor, more, tmp_path):
+    """By the shapes whose contact with the floor MuJoCo makes with other values than its defaults."""
+    file = tmp_path / "soft.xml"
+    file.write_text(SOFT.format(floor=floor, pair=more, option=""))
+    model = mujoco.MjModel.from_xml_path(str(file))
+    data, wanted = mujoco.MjData(model), {}
+    mujoco.mj_forward(model, data)
+    usual = {"solref": [0.02, 1], "solreffriction": [0, 0], "solimp": [0.9, 0.95, 0.001, 0.5, 2]}
+    for contact in data.contact:
+        changed = [name for name, value in usual.items() if list(getattr(contact, name)) != value]
+        wanted[model.geom(contact.geom[1]).name] = ", ".join(changed)
+    assert len(wanted) == 5 and set(wanted.values()) > {""}
+    with pytest.warns(UserWarning) as said:
+        scene = spo.load(file, contacts=True)
+    message = str(said[0].message)
+    for text in set(wanted.values()) - {""}:
+        names = [f"sphere '{c.label}' of body 'b'" for c in scene.contacts if wanted[c.label] == text]
+        assert f"{text} of {', '.join(names)} (stiffness and damping are chosen" in message
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # shapes that are not chosen, and defaults, say nothing
+        spo.load(file, contacts="first", ground=spo.Plane())
+    file.write_text(
+        SOFT.format(floor="", pair="", option='o_solref="0.04 1"').replace(
+            "/><worldbody>", '><flag override="enable"/></option><worldbody>'
+        )
+    )
+    with pytest.warns(UserWarning, match="solref of sphere 'plain' of body 'b', sphere 'slow'"):
+        spo.load(file, contacts=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import mujoco
@@ -16,6 +17,8 @@ from .source import Source
 GEOMS = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")): name.lower() for name in (
     "PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH", "SDF")}  # fmt: skip
 """MuJoCo's kinds by number."""
+SOFTNESS = {"solref": (0.02, 1.0), "solreffriction": (0.0, 0.0), "solimp": (0.9, 0.95, 0.001, 0.5, 2.0)}
+"""How soft a contact of MuJoCo is where a file does not say."""
 Pairs = dict[frozenset[int], int]  # number of an explicit pair by its two geoms
 KINDS = {"hfield": "height field", **{name.lower(): kind for name, kind in kinds_in("mujoco").items()}}
 
@@ -44,8 +47,8 @@ def collision_shapes(source: Source, moving: np.ndarray) -> list[CollisionShape]
             found.append(_shape(source, geom, None, 0.0))
             continue
         ground = touched[0] if touched else None
-        friction = _friction(source, geom, ground, pairs)
-        found.append(_shape(source, geom, friction, _margin(source, geom, ground, pairs)))
+        shape = _shape(source, geom, _friction(source, geom, ground, pairs), _margin(source, geom, ground, pairs))
+        found.append(dataclasses.replace(shape, unread=_unread_softness(source, geom, ground, pairs)))
     return found
 
 
@@ -80,13 +83,31 @@ def _friction(source: Source, geom: int, ground: int | None, pairs: Pairs) -> fl
             words = f"the friction {across:g} across of a contact pair of {source.words('geom', geom)}"
             source.left_out.append(f"{words}, which has {value:g} in all directions")
     else:
-        both = [geom] if ground is None else [geom, ground]
-        priority = max(m.geom_priority[g] for g in both)
-        both = [g for g in both if m.geom_priority[g] == priority]
+        both = _counting(m, geom, ground)
         value, dimensions = (max(values[g] for g in both) for values in (m.geom_friction[:, 0], m.geom_condim))
     if source.enabled("OVERRIDE"):
         value = m.opt.o_friction[0]
     return float(value) if dimensions > 1 else 0.0
+
+
+def _counting(m: Any, geom: int, ground: int | None) -> list[int]:
+    """Return the geoms of a contact that give it its values: those of the highest priority."""
+    both = [geom] if ground is None else [geom, ground]
+    priority = max(m.geom_priority[g] for g in both)
+    return [g for g in both if m.geom_priority[g] == priority]
+
+
+def _unread_softness(source: Source, geom: int, ground: int | None, pairs: Pairs) -> str:
+    """Return which of MuJoCo's values for the softness of a geom's contact with a ground are not its defaults."""
+    m = source.model
+    pair = None if ground is None else pairs.get(frozenset((geom, ground)))
+    if source.enabled("OVERRIDE"):
+        rows = {name: [getattr(m.opt, f"o_{name}")] for name in ("solref", "solimp")}
+    elif pair is not None:
+        rows = {name: [getattr(m, f"pair_{name}")[pair]] for name in SOFTNESS}
+    else:
+        rows = {name: getattr(m, f"geom_{name}")[_counting(m, geom, ground)] for name in ("solref", "solimp")}
+    return ", ".join(name for name, values in rows.items() if (np.array(values) != SOFTNESS[name]).any())
 
 
 def _margin(source: Source, geom: int, ground: int | None, pairs: Pairs) -> float:

@@ -40,8 +40,8 @@ def from_mujoco(model: Any, contacts: Any = None, ground: Any = None, points: in
     Args:
         model: a ``mujoco.MjModel``, of MuJoCo 3.11 or newer.
         contacts, ground, points: which geoms touch which ground, as in :func:`load`. Friction and margin are those of
-            the geom on MuJoCo's ground; ``solref`` and ``solimp`` are not read: stiffness and damping are chosen as
-            :class:`Contact` says.
+            the geom on MuJoCo's ground; stiffness and damping are chosen as :class:`Contact` says. A warning names
+            the geoms whose contact has another ``solref`` or ``solimp`` than MuJoCo's default.
 
     Raises:
         TypeError: the argument is not a ``mujoco.MjModel``.

@@ -31,6 +31,10 @@ UPRIGHT = 0.5  # least cosine between the normal of a ground and the upward dire
 STEEP = ", steeper than 60 degrees"  # what a ground is that is not UPRIGHT
 AXIS_TOLERANCE = 1e-6  # by which axes of a height field may differ from the inertial ones
 GROUNDS = ("plane", "height field")
+NAMED = 6  # shapes of one kind that a warning names
+MATERIAL_VALUES = (
+    "stiffness and damping are chosen; scene.with_values(contact_stiffness=, contact_damping=) sets others"
+)
 NO_GROUND = (
     "all contacts, because there is no plane and no height field to touch (ground=spo.Plane() adds a floor; a pattern, "
     "such as contacts='*', takes the plane z = 0)"
@@ -57,6 +61,7 @@ class CollisionShape:
         friction, stiffness, damping: of its material; None where the source has none.
         names: other names that patterns match, such as that of its mesh. index: its number in the source.
         triangles: of a hull that stands for a mesh with hollows, maybe: its points by number [n, 3]; None: it has none.
+        unread: what of its material a contact does not take, in words; "" if there is nothing.
     """
 
     label: str
@@ -71,6 +76,7 @@ class CollisionShape:
     names: tuple[str, ...] = ()
     index: int = -1
     triangles: Any = None
+    unread: str = ""
 
     def contact_shape(self, clean: bool = False) -> ContactShape:
         """Return the geometry of a shape whose kind is one of ``KINDS``; ``clean`` as of :class:`Placement`."""
@@ -199,6 +205,10 @@ class ShapeSelection(NamedTuple):
         if complete and self.contacts is True and ground is None and not any(shape.kind in GROUNDS for shape in others):
             words += [NO_GROUND] if selected else []
             selected = []
+        for unread in dict.fromkeys(shape.unread for shape, _ in selected if shape.unread):
+            names = [shape.words(scene.body_labels) for shape, _ in selected if shape.unread == unread]
+            more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+            words.append(f"{unread} of {', '.join(names[:NAMED])}{more} ({MATERIAL_VALUES})")
         return SelectedContacts(
             [(shape, contacts_of(material_rule(shape, ground_shape), most)) for shape, most in selected],
             ground,
