@@ -98,11 +98,15 @@ REFUSED = {
               JOINT.format("k", "revolute", "b", "c", '<mimic joint="j"/>')),
         r"line 6, <mimic>: joints 'j', 'k' mimic each other in a circle",
     ),
-    "mimic_of_fixed": (
+    "mimic_of_ball": (
         robot(*FINGERS, JOINT.format("j", "revolute", "a", "b", '<mimic joint="k"/>'),
-              JOINT.format("k", "fixed", "b", "c", "")),
-        r"line 5, <mimic>: ties 'j' to 'k'; joint 'k' is fixed",
+              JOINT.format("k", "spherical", "b", "c", "")),
+        r"line 5, <mimic>: ties 'j' to 'k'; joint 'k' is spherical",
     ),
+    "no rpy": (robot(*pair("fixed", '<origin rpy=""/>')), r"line 4, <origin>: rpy is ''; expected 3 finite numbers; w"),
+    "no words": (robot(*pair("fixed", '<origin xyz=" "/>')), r"line 4, <origin>: xyz is ' '; expected 3 finite number"),
+    "no mass": (robot(LINK.format("a").replace('"2"', '""')), r"line 2, <mass>: value is ''; expected 1 finite number"),
+    "empty name": (robot('<link name=""/>'), r"line 2, <link>: attribute 'name' is empty; expected a value"),
 }  # fmt: skip
 
 
@@ -178,6 +182,53 @@ def test_a_mimic_of_a_mimic_follows_the_joint_that_moves(tmp_path):
     scene = load(written(tmp_path, robot(*links, *joints)))
     found = [(c.hinge, c.reference, c.ratio, c.offset) for c in scene.couplings]
     assert found == [(1, 3, -6.0, 1.0), (2, 3, -3.0, 0.25)]  # j = 0.5 + 2 (0.25 - 3 l)
+
+
+@pytest.mark.parametrize("kind", ["continuous", "prismatic"])
+def test_a_mimic_of_a_fixed_joint_holds_its_joint_with_a_warning(kind, tmp_path):
+    """A fixed joint's coordinate is zero. MuJoCo warns and lets the joint move: it is placed at its offset here."""
+    place = '<origin xyz=".1 .2 .3" rpy=".4 .5 -.6"/><axis xyz="0 .6 .8"/>'
+    joints = [
+        JOINT.format("j", kind, "a", "b", place + '<mimic joint="k" multiplier="2" offset=".5"/>'),
+        JOINT.format("k", kind, "b", "c", place + '<mimic joint="l" multiplier="3" offset=".25"/>'),
+        JOINT.format("l", "fixed", "c", "d", place),
+    ]
+    text = robot(*(LINK.format(k) for k in "abcd"), *joints)
+    with pytest.warns(
+        UserWarning, match=r"line 6: joints that mimic a fixed one are held.*: 'j' at 1, 'k' at 0.25; rem"
+    ):
+        scene = load(written(tmp_path, text))
+    assert scene.dof_count == 0 and not scene.couplings
+    spec = mujoco.MjSpec.from_string(re.sub("<mimic[^>]*>", "", text))
+    spec.compiler.fusestatic = False
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:] = 1.0, 0.25
+    mujoco.mj_forward(model, data)
+    for body in "bcd":
+        expected = np.eye(4)
+        expected[:3, :3], expected[:3, 3] = data.body(body).xmat.reshape(3, 3), data.body(body).xpos
+        pose = homogeneous(Dense(scene, np.zeros(0)).body_poses[scene.body_labels.index(f"r/{body}")])
+        np.testing.assert_allclose(pose, expected, atol=1e-14)
+
+
+def test_limits_that_stop_a_joint_are_named_once(tmp_path):
+    """The joints move and are pushed with the values that the warning's way out gives; MuJoCo's effort="0" is none."""
+    stop, loose = '<limit lower="0" upper="0" effort="0" velocity="0"/>', '<limit effort="0" velocity="3"/>'
+    kinds = {"j": ("revolute", stop), "k": ("continuous", stop), "l": ("prismatic", loose), "m": ("planar", LIMIT)}
+    kinds |= {"n": ("fixed", stop), "o": ("revolute", LIMIT), "p": ("floating", '<limit effort="0" velocity="0"/>')}
+    parts = [JOINT.format(name, kind, "a", name, limit) for name, (kind, limit) in kinds.items()]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scene = load(written(tmp_path, robot(*(LINK.format(k) for k in "ajklmnop"), *parts)))
+    (warning,) = caught
+    words = str(warning.message)
+    assert warning.filename == __file__
+    assert "effort=\"0\" of joints 'j', 'k', 'l' lets" in words and "velocity=\"0\" of joints 'j', 'k' holds" in words
+    assert "lower = upper of joints 'j' holds them there" in words and "<limit> of joints 'm', which" in words
+    for name in ("effort_limit", "velocity_limit", "limit_lower", "limit_upper"):
+        assert f"scene.with_values(joint_{name}=..." in words or f"joint_{name}=...)" in words
+        scene.with_values(**{f"joint_{name}": np.full(scene.dof_count, -1e6 if "lower" in name else 1e6)})
 
 
 def test_a_mimic_of_no_joint_is_left_out_with_a_warning(tmp_path):

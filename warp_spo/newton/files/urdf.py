@@ -9,7 +9,7 @@ without <inertial> has no mass, a "continuous" joint has no limits, and a "plana
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,12 @@ import numpy as np
 
 from ...errors import UnsupportedError
 from ...scene.collision_shapes import NONE, ShapeSelection
-from ...scene.parts import UNLIMITED, Body, Coupling, Hinge
+from ...scene.parts import UNLIMITED, Body, Hinge
 from ...scene.scene import Scene
 from ..worlds import quote_labels
 from .inertia_repair import repair_bodies
 from .urdf_masses import mass_of_shapes
+from .urdf_mimics import SCALAR, read_mimics
 from .urdf_shapes import urdf_shapes
 from .xml_source import XmlElement, read_xml
 
@@ -35,7 +36,18 @@ KINDS = {
     "spherical": "ball",  # of Bullet and MuJoCo, not of URDF
 }
 """Hinge of a scene by type of the joint."""
-SCALAR = ("revolute", "continuous", "prismatic")
+LIMITS = ("lower", "upper", "effort", "velocity")
+LIMIT_WARNINGS = {
+    "effort": 'effort="0" of joints {} lets no drive, actuator or effort action push them; pass the bound that is '
+    "meant, or 1e6 for none, to scene.with_values(joint_effort_limit=...)",
+    "velocity": 'velocity="0" of joints {} holds them still; pass the bound that is meant, or 1e6 for none, to '
+    "scene.with_values(joint_velocity_limit=...)",
+    "span": "lower = upper of joints {} holds them there; pass the range that is meant to "
+    "scene.with_values(joint_limit_lower=..., joint_limit_upper=...)",
+    "unread": "left out: the <limit> of joints {}, which are planar, floating or spherical; "
+    "pass limits of their degrees of freedom to scene.with_values",
+}
+"""Words about joints whose <limit> stops them, or is not read."""
 NO_LIMITS: dict[str, Any] = {"limit_ke": 0.0, "limit_kd": 0.0}  # of free and ball hinges, as in Newton
 QUARTER = np.pi / 2
 TYPED = 5e-10  # an angle this close to a multiple of a quarter turn [rad] is one that was written with ten digits
@@ -59,10 +71,11 @@ def read_urdf(file: Path, floating: bool | None, repair: bool, selection: ShapeS
     kind, base_name = ("free", "floating_base") if floating else ("fixed", "fixed_base")
     base = Hinge(kind, -1, 0, label=label(base_name), **NO_LIMITS)
     number = {link: index for index, link in enumerate([root, *(_ends(joint)[1] for joint in carried)])}
-    hinges = [base, *(_hinge(joint, number, label) for joint in carried)]
+    couplings, held = read_mimics(carried)
+    hinges = [base, *(_hinge(joint, number, label, held.get(index)) for index, joint in enumerate(carried))]
+    _warn_of_limits(carried, held)
     inertials = _inertials([links[link] for link in number], hinges, repair)
     masses, inertias = [i[0] for i in inertials], [i[2] for i in inertials]
-    couplings = _couplings(carried)
     try:
         if repair:
             masses, inertias = repair_bodies(list(map(label, number)), masses, inertias, depth=3)
@@ -152,8 +165,11 @@ def _sort_joints(
 
 
 # -- joints ------------------------------------------------------------------------------------------------------------
-def _hinge(joint: XmlElement, number: dict[str, int], label: Callable[[str], str]) -> Hinge:
-    """Return the hinge of a joint; ``number`` is the index of each link's body."""
+def _hinge(joint: XmlElement, number: dict[str, int], label: Callable[[str], str], held: float | None) -> Hinge:
+    """Return the hinge of a joint; ``number`` is the index of each link's body.
+
+    ``held`` is the coordinate at which the joint is fixed, None if it moves.
+    """
     kind, (parent, child) = joint.needed("type"), _ends(joint)
     if kind not in KINDS:
         raise joint.error(f"the type is {kind!r}; expected one of {', '.join(KINDS)}")
@@ -167,7 +183,11 @@ def _hinge(joint: XmlElement, number: dict[str, int], label: Callable[[str], str
         values["axis"] = _in_plane(axis) if kind == "planar" else axis
     if kind in SCALAR:
         values |= _limits(joint, kind)
-    pose = np.concatenate(_origin(joint))
+    position, turn = _origin(joint)
+    if held is not None:
+        position, turn = _moved(position, turn, kind, _axis(joint), held)
+        kind, values = "fixed", {}
+    pose = np.concatenate([position, turn])
     try:
         return Hinge(
             KINDS[kind], number[parent], number[child], parent_pose=pose, label=label(joint.needed("name")), **values
@@ -188,6 +208,17 @@ def _origin(holder: XmlElement) -> tuple[np.ndarray, np.ndarray]:
     # The product of the turns about z, y and x: each is (sine of the half angle along its axis, cosine).
     quaternion = [u * v * x - z * y * w, u * y * w + z * v * x, z * v * w - u * y * x, u * v * w + z * y * x]
     return origin.numbers("xyz", 3, (0.0, 0.0, 0.0)), np.array(quaternion)
+
+
+def _moved(
+    position: np.ndarray, turn: np.ndarray, kind: str, axis: np.ndarray, q: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the position and the unit quaternion of a joint's child where the joint's coordinate is ``q``."""
+    if kind == "prismatic":
+        return position + _rotation(turn) @ axis * q, turn
+    (v, w), (sine, cosine) = (turn[:3], turn[3]), _half(q)
+    u = sine * axis
+    return position, np.append(w * u + cosine * v + np.cross(v, u), w * cosine - v @ u)
 
 
 def _half(angle: float) -> tuple[float, float]:
@@ -255,47 +286,28 @@ def _limits(joint: XmlElement, kind: str) -> dict[str, float]:
     return found
 
 
-def _couplings(joints: list[XmlElement]) -> list[Coupling]:
-    """Return the couplings of all mimics; hinge 0 is the base, hinge k + 1 that of joint k.
+def _warn_of_limits(joints: list[XmlElement], held: Container[int]) -> None:
+    """Warn once of limits that stop joints or what drives them, and of limits that are not read; name the joints.
 
-    A mimic of a mimic is followed to the joint that moves by itself. A mimic on a fixed joint says nothing. A mimic
-    of a joint that is not there is left out, with a warning.
+    ``held`` are the indices of joints that have no degree of freedom.
     """
-    by_name = {joint.get("name"): index for index, joint in enumerate(joints)}
-    mimics = [joint.child("mimic") if joint.get("type") != "fixed" else None for joint in joints]
-    couplings = []
-    for index, mimic in enumerate(mimics):
-        if mimic is None:
+    found: dict[str, list[str]] = {name: [] for name in LIMIT_WARNINGS}
+    for index, joint in enumerate(joints):
+        limit, kind = joint.child("limit"), joint.get("type")
+        if limit is None or kind == "fixed" or index in held:
             continue
-        ratio, offset, leader, seen = 1.0, 0.0, index, [index]
-        at: XmlElement | None = mimic
-        while at is not None:
-            offset, ratio = offset + ratio * at.number("offset", 0.0), ratio * at.number("multiplier", 1.0)
-            leader = by_name.get(at.needed("joint"), -1)
-            if leader < 0:
-                break
-            if leader in seen:
-                names = quote_labels([str(joints[joint].get("name")) for joint in seen])
-                raise at.error(f"joints {names} mimic each other in a circle; let one of them move by itself")
-            seen.append(leader)
-            at = mimics[leader]
-        if leader < 0:
-            warnings.warn(
-                f"load: {str(mimic.file)!r}, line {mimic.line}: joint {joints[index].get('name')!r} mimics "
-                f"{at.get('joint')!r}, which is no joint of the file; it moves by itself; correct the name",  # type: ignore[union-attr]
-                UserWarning,
-                stacklevel=4,
-            )
-            continue
-        for joint in (joints[index], joints[leader]):
-            if joint.get("type") not in SCALAR:
-                raise mimic.error(
-                    f"ties {joints[index].get('name')!r} to {joints[leader].get('name')!r}; joint "
-                    f"{joint.get('name')!r} is {joint.get('type')}; expected one of {', '.join(SCALAR)}; "
-                    "remove the mimic, or make both joints fixed"
-                )
-        couplings.append(Coupling(index + 1, leader + 1, ratio, offset))
-    return couplings
+        given = {name: limit.number(name, infinite=True) for name in LIMITS if limit.get(name) is not None}
+        if kind not in SCALAR:
+            said = ["unread"] if any(given.values()) else []
+        else:
+            said = [name for name in ("effort", "velocity") if given.get(name) == 0.0]
+            spans = kind != "continuous" and "lower" in given and given["lower"] == given.get("upper")
+            said += ["span"] if spans else []
+        for name in said:
+            found[name].append(str(joint.get("name")))
+    parts = [LIMIT_WARNINGS[name].format(quote_labels(names)) for name, names in found.items() if names]
+    if parts:
+        warnings.warn(f"load: {str(joints[0].file)!r}: {'; '.join(parts)}", UserWarning, stacklevel=4)
 
 
 # -- links -------------------------------------------------------------------------------------------------------------

@@ -39,8 +39,10 @@ class XmlElement(ET.Element):
     def needed(self, name: str) -> str:
         """Return an attribute that must be there."""
         value = self.get(name)
-        if not value:
+        if value is None:
             raise self.error(f"no attribute {name!r}; expected one; write it")
+        if not value:
+            raise self.error(f"attribute {name!r} is empty; expected a value; write it")
         return value
 
     def number(self, name: str, default: float | None = None, least: float = -np.inf, infinite: bool = False) -> float:
@@ -57,14 +59,16 @@ class XmlElement(ET.Element):
         """Return an attribute that is ``count`` numbers [count]; without a default it must be there."""
         if self.get(name) is None and default is not None:
             return np.array(default, dtype=np.float64)
-        text = self.get(name) or self.needed(name)
+        given = self.get(name)
+        text = self.needed(name) if given is None else given
         try:
             values = np.array([float(word) for word in text.split()])
         except ValueError:
             values = np.array([np.nan])
         wrong = np.isnan(values) if infinite else ~np.isfinite(values)
         if len(values) != count or wrong.any() or "_" in text:  # Python reads 1_000
-            raise self.error(f"{name} is '{shown(text)}'; expected {count} finite number{'s' * (count > 1)}")
+            way_out = "" if text.strip() or default is None else "; write them, or remove the attribute"
+            raise self.error(f"{name} is '{shown(text)}'; expected {count} finite number{'s' * (count > 1)}{way_out}")
         return values
 
 
