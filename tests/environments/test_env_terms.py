@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import warp_spo as spo
-from support.env_scenes import FEET, walker_env, walker_q, walker_scene
+from support.env_scenes import FEET, cart_env, cart_scene, walker_env, walker_q, walker_scene
 from warp_spo.env import Env, actions, commands, events, observations, rewards, terminations
 
 TERMS = {
@@ -187,3 +187,38 @@ def test_bodies_that_touch_each_other_are_seen_and_changed():
     with pytest.raises(ValueError, match=r"events.randomise: no contact is of a body 'pusher'"):
         bare = scene.with_contacts(scene.contacts[:1])
         Env(bare, 3, "cpu", events=[events.randomise("contact_friction", (0.1, 0.2), "set", "pusher")], **options)
+
+
+def limited_cart():
+    """A cart of 1 kg that a motor and an effort action may push with 2 N, and its pole."""
+    scene = cart_scene()
+    scene = spo.Scene(scene.bodies, scene.hinges, gravity=(0, 0, 0), actuators=[spo.Actuator(0)])
+    return scene.with_values(joint_effort_limit=[2.0, 1e6])
+
+
+@pytest.mark.parametrize("action", [actions.Effort("slide", scale=50.0), actions.Control(scale=50.0)], ids=str)
+def test_actions_obey_the_effort_limit(action):
+    """A push of 50 N is one of the limit, also where an event draws it, as MuJoCo's motors have it; small ones stay."""
+    drawn = events.randomise("joint_effort_limit", (1.0, 3.0), "set", "slide")
+    for change in ([], [drawn]):
+        env = Env(
+            limited_cart(), 3, "cpu", actions=action, decimation=1, events=change,
+            observations={"actor": [lambda w: w.joint_force, lambda w: w.qd]}, rewards={"none": (1.0, lambda w: 0.0)},
+        )  # fmt: skip
+        limits = env.values["joint_effort_limit"][:, 0].numpy() if change else np.full(3, 2.0)
+        observed = env.step(torch.tensor([[1.0], [-1.0], [0.01]]))[0]["actor"].numpy()
+        expected = np.clip([50.0, -50.0, 0.5], -limits, limits)
+        np.testing.assert_allclose(observed[:, 0], expected, rtol=1e-6)
+        M = spo.Dynamics(limited_cart(), 1, "cpu", "float64").mass_matrix(np.zeros((1, 2)))[0]
+        np.testing.assert_allclose(observed[:, 2], env.dt * expected * np.linalg.inv(M)[0, 0], rtol=1e-3)
+
+
+def test_exported_scales_are_those_below_the_effort_limit():
+    """Scale and offset are measured; a push of half an action is beyond the limit."""
+    export = pytest.importorskip("warp_spo.env.export")
+    env = cart_env(2, actions=actions.Effort("slide", scale=5000.0, offset=0.5), scene=limited_cart())
+    scale, offset, gains = export.controls_of(env)
+    np.testing.assert_allclose([*scale, *offset], [5000.0, 0.5], rtol=1e-3)
+    assert gains["force_limit"] == [2.0]
+    scale, offset, gains = export.controls_of(cart_env(2, actions=actions.Control(), scene=limited_cart()))
+    assert (scale, offset, gains["force_limit"]) == (1.0, 0.0, [2.0])

@@ -144,14 +144,20 @@ def test_armature_and_damping_of_an_actuator(device):
     np.testing.assert_allclose(both.scene.values["joint_armature"][0, 6], 0.3 + 9 * 0.2)
 
 
-def test_a_symmetric_actuatorfrcrange_is_the_effort_limit_of_drives():
-    """The actuator's own range, before its gear, is what the joint lets through."""
-    text = FREE.replace('name="a"', 'name="a" actuatorfrcrange="-2 2" actuatorfrclimited="true"')
-    scene = spo.from_mujoco(
-        compiled(text.format(**EMPTY | {"more": '<actuator><motor joint="a" gear="-4"/></actuator>'}))
-    )
-    assert scene.values["joint_effort_limit"][0].tolist() == [1e6] * 6 + [2.0]
-    assert scene.actuators[0].force_range == (-0.5, 0.5)
+def test_an_even_actuatorfrcrange_is_the_effort_limit(device):
+    """It bounds the sum of two motors and of a tendon's servo. An uneven one is part of its one actuator's range."""
+    limited = 'actuatorfrclimited="true" actuatorfrcrange='
+    world = TIES.replace('name="y" axis', f'name="y" {limited}"-.2 .1" axis')
+    world = world.replace('name="x" axis', f'name="x" {limited}"-.7 .7" axis')
+    more = ACTUATORS.replace("<actuator>", '<actuator><motor name="second" joint="x" gear="-3"/>')
+    text = FREE.format(root="", world=world, more=more).replace('name="a"', f'name="a" {limited}"-2 2"')
+    model = compiled(text)
+    scene = spo.from_mujoco(model)
+    labels = [label.split("/")[-1] for label in scene.dof_labels]
+    limits = dict(zip(labels, scene.values["joint_effort_limit"][0].tolist(), strict=True))
+    assert (limits["a"], limits["x"], limits["y"]) == (2.0, 0.7, 1e6)
+    both = Agreement(model, scene, 8, device=device, granularity="node")
+    assert both.actuator_error(3.0 * np.random.default_rng(1).normal(size=(8, model.nu))) <= EXACT
 
 
 def test_sites_and_keyframes(device):

@@ -64,10 +64,10 @@ CASES = {
     "ball motor": ({"more": '<actuator><motor name="m" joint="ball"/></actuator>'}, "acts on joint 'ball'", "hinges"),
     "two bounded": (
         {
-            "turn": 'actuatorfrcrange="-1 1" actuatorfrclimited="true"',
+            "turn": 'actuatorfrcrange="-1 2" actuatorfrclimited="true"',
             "more": '<actuator><motor joint="turn"/><motor joint="turn"/></actuator>',
         },
-        "joint 'turn', whose actuatorfrcrange bounds the sum of several actuators",
+        "joint 'turn', whose uneven actuatorfrcrange bounds the sum of several actuators",
         "forcerange",
     ),
     "actuatorgravcomp": (

@@ -68,15 +68,17 @@ def arm(actuators, **values):
     return scene.with_values(**values) if values else scene
 
 
-def mujoco_arm(actuators, dt=1e-3):
-    """The same in MuJoCo, with these elements."""
+def mujoco_arm(actuators, dt=1e-3, limits=()):
+    """The same in MuJoCo, with these elements; ``limits`` are the joints' effort limits."""
     import mujoco
 
     text = lambda numbers: " ".join(map(str, numbers))  # noqa: E731
     body = f'<inertial pos="{text(COM)}" mass="{MASS}" diaginertia="{text(np.diag(INERTIA))}"/>'
-    return mujoco.MjModel.from_xml_string(
-        ARM.format(dt=dt, body=body, offset=text(OFFSET), actuators=" ".join(actuators))
-    )
+    arm_text = ARM.format(dt=dt, body=body, offset=text(OFFSET), actuators=" ".join(actuators))
+    for name, limit in zip("abc", limits, strict=False):
+        joint = f'<joint name="{name}" axis'
+        arm_text = arm_text.replace(joint, joint.replace("axis", f'actuatorfrcrange="{-limit} {limit}" axis'))
+    return mujoco.MjModel.from_xml_string(arm_text)
 
 
 def everything(**values):

@@ -15,7 +15,7 @@ def cart_scene():
     return spo.Scene([cart, pole], [slide, spo.Hinge("revolute", 0, 1, axis=(0, 1, 0), label="hinge")])
 
 
-def cart_env(worlds=8, device="cpu", **changes):
+def cart_env(worlds=8, device="cpu", scene=None, **changes):
     """Return a cart with a pole: observed q, qd; rewarded cos of the angle."""
     options = {
         "actions": actions.Effort("slide", scale=10.0),
@@ -25,7 +25,7 @@ def cart_env(worlds=8, device="cpu", **changes):
         "events": [events.joints((-0.1, 0.1), (-0.2, 0.2))],
         "episode_length_s": 0.4,
     }
-    return Env(cart_scene(), worlds, device, **(options | changes))
+    return Env(cart_scene() if scene is None else scene, worlds, device, **(options | changes))
 
 
 def walker_scene(delay=1):

@@ -30,7 +30,7 @@ ACTUATOR_FORCE = Operation(
         Routine("actuator_force_vjp", adjoints.actuator_force_vjp),
         by=("q", "qd", "ctrl"),
         state=("q", "qd", "ctrl"),
-        values=ACTUATION,
+        values=(*ACTUATION, "joint_effort_limit"),
         embed=AS_WRITTEN,
         multipliers=AS_WRITTEN,
     ),
@@ -42,7 +42,8 @@ ACTUATOR_FORCE = Operation(
 def actuator_force(self: Dynamics, q: ArrayT, qd: AnyArray | None, ctrl: AnyArray, out: ArrayT | None = None) -> ArrayT:
     """Compute the forces of the scene's actuators, see :class:`Actuator`: tau for other calls [world, dof].
 
-    Delays have no part in it: ``ctrl`` acts at once. Derivatives by a control or a force beyond its range are zero.
+    The sum of the forces on a hinge is at most its ``joint_effort_limit``. Delays have no part in it: ``ctrl`` acts at
+    once. Derivatives by a control or a force beyond its range are zero.
 
     Args:
         q: coordinates [world, coordinate].

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from ..recursions.step.joint_laws import DEFAULT_BOUND, FREE
 from ..scene.scene import Scene
-from ..trace.functions import clip
+from ..trace.functions import AbstractScalar, clip, where
 from .compile.vectors import Vector, find
 from .validation import check_optional_span
 from .world import World
@@ -117,7 +118,9 @@ class Position:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Effort(Position):
-    """Forces of joints: ``tau = offset + scale action`` [N m or N].
+    """Forces of joints: ``tau = offset + scale action`` [N m or N], at most the joint's ``joint_effort_limit``.
+
+    A drive or an actuator of the same joint has the limit for itself.
 
     Args:
         joints: regular expressions of labels; None: all joints of one coordinate.
@@ -136,6 +139,20 @@ class Effort(Position):
     def entries(self, scene: Scene) -> list[int]:
         """Return which entries of the array the actions set."""
         return [int(scene.qd_start[i]) for i in self.hinges(scene)]
+
+    def trace(self, w: World, action: Vector) -> list[tuple[int, Any]]:
+        """Return (entry, value) of what the actions set."""
+        limits = w.value("joint_effort_limit")
+        return [(dof, within(force, limits[dof])) for dof, force in Control.trace(self, w, action)]  # type: ignore[arg-type]
+
+
+def within(force: Any, limit: Any) -> Any:
+    """Return a force of a joint held within its effort limit; one of DEFAULT_BOUND and more is none."""
+    if isinstance(limit, AbstractScalar):
+        limit = where(limit < DEFAULT_BOUND, limit, FREE)
+    elif not limit < DEFAULT_BOUND:
+        return force
+    return clip(force, -limit, limit)
 
 
 def spread(call: str, name: str, value: Any, labels: list[str]) -> np.ndarray:

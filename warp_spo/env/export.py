@@ -9,8 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..recursions.step.joint_laws import DEFAULT_BOUND
 from .environment import Env
 from .tasks import TASKS, task
+
+SHORTER = 2.0**-4  # share of a change of an action
+STEEPER = 1e-3  # of a slope; more than rounding of float32 where an offset is a hundred times what an action moves
+MOST_ROUNDS = 8  # of shorter changes: forces of up to 2^32 of their limit
 
 
 def describe(env: Env, name: str) -> dict[str, Any]:
@@ -66,19 +71,20 @@ def controls_of(env: Env) -> tuple[np.ndarray, np.ndarray, dict[str, list]]:
 
     The environment is reset afterwards.
     """
-    scene, rows = env.scene, []
+    scene = env.scene
     clips = [(-np.inf, np.inf) if clip is None else clip for clip in env.action_clips]
     base = np.array([min(max(0.0, low), high) for low, high in clips])
     # each action moves up, or down where its base is its upper limit
     change = np.array([min(0.5, high - at) or low - at for at, (low, high) in zip(base, clips, strict=True)])
-    given = torch.tensor(base + np.vstack([np.zeros(len(change)), np.diag(change)]), dtype=torch.float32)
     biases = [env.memory("encoder bias")] if env._layout.biased else []
     drawn = [bias.clone() for bias in biases]
     for bias in biases:
         bias.zero_()  # world 0 has a random encoder bias, the robot of the exported policy has none
-    for actions in given:
-        controls = env.controls(actions.expand(env.num_envs, -1))
-        rows.append({array: values[0].double().cpu().numpy() for array, values in controls.items()})
+    rows = _measure(env, base, change)
+    for _ in range(MOST_ROUNDS):
+        if not _shorten(env, rows, base, change):
+            break
+        rows = _measure(env, base, change)
     for bias, before in zip(biases, drawn, strict=True):
         bias.copy_(before)
     env.reset()
@@ -102,6 +108,8 @@ def controls_of(env: Env) -> tuple[np.ndarray, np.ndarray, dict[str, list]]:
             law, delay = scene.values["actuator_bias"][0, i], scene.values["actuator_delay"][0, i]
             stiffness, damping, limit = -law[1], -law[2], scene.values["actuator_force_range"][0, i, 1]
             dof = int(scene.qd_start[scene.actuators[i].hinges[0]])
+            effort, gear = scene.values["joint_effort_limit"][0, dof], abs(scene.actuators[i].gear[0])
+            limit = min(limit, effort / gear) if 0.0 < gear and effort < DEFAULT_BOUND else limit
         else:
             dof = int(i) if array == "tau" else int(scene.qd_start[list(scene.q_start).index(i)])
             stiffness, damping = (scene.values[f"joint_target_{k}"][0, dof] for k in ("ke", "kd"))
@@ -111,6 +119,30 @@ def controls_of(env: Env) -> tuple[np.ndarray, np.ndarray, dict[str, list]]:
         for key, value in zip(gains, found, strict=True):
             gains[key].append(value)
     return np.array(scale), np.array(offset), gains
+
+
+def _measure(env: Env, base: np.ndarray, change: np.ndarray) -> list[dict[str, np.ndarray]]:
+    """Return what the actions ``base`` set, and what they set with each action moved by its ``change`` alone."""
+    given = torch.tensor(base + np.vstack([np.zeros(len(change)), np.diag(change)]), dtype=torch.float32)
+    found = []
+    for actions in given:
+        controls = env.controls(actions.expand(env.num_envs, -1))
+        found.append({array: values[0].double().cpu().numpy() for array, values in controls.items()})
+    return found
+
+
+def _shorten(env: Env, rows: list[dict[str, np.ndarray]], base: np.ndarray, change: np.ndarray) -> bool:
+    """Shorten each ``change`` by which a force reached its joint's effort limit; return whether any did.
+
+    It reached it where a change that is shorter, by a power of two, has a steeper slope.
+    """
+    if "tau" not in rows[0]:
+        return False
+    shorter = _measure(env, base, change * SHORTER)
+    moves = [np.array([row["tau"] - each[0]["tau"] for row in each[1:]]) for each in (rows, shorter)]
+    held = np.any(np.abs(moves[1]) > (1.0 + STEEPER) * SHORTER * np.abs(moves[0]), axis=1)
+    change[held] *= SHORTER
+    return bool(held.any())
 
 
 def save(runner: Any, env: Env, name: str, path: str | Path) -> list[Path]:

@@ -236,8 +236,10 @@ class World:
         """Force of actuators, drives and efforts, as actions command, in the state after the step [dof] [N m or N]."""
         arrays, count = self._layout.action_arrays, self.scene.dof_count
         total = vector(0.0 for _ in range(count))
+        actuators = self.read("actuator_force", count) if "ctrl" in arrays else total
+        acted = {int(self.scene.qd_start[hinge]) for each in self.scene.actuators for hinge in each.hinges}
         if "ctrl" in arrays:
-            total = total + self.read("actuator_force", count)
+            total = total + actuators
         if "tau" in arrays:
             total = total + self.read("tau", count)
         if "target_q" in arrays:
@@ -247,7 +249,10 @@ class World:
                 i, j = int(self.scene.q_start[hinge]), int(self.scene.qd_start[hinge])
                 limit = as_scalar(most[j])
                 force = as_scalar(ke[j]) * (target[i] - self.q[i]) - as_scalar(kd[j]) * self.qd[j]
-                total[j] = total[j] + clip(force, -limit, limit)
+                if "ctrl" in arrays and j in acted:  # the limit is that of both together
+                    total[j] = total[j] + clip(force + actuators[j], -limit, limit) - actuators[j]
+                else:
+                    total[j] = total[j] + clip(force, -limit, limit)
         return total
 
     # -- ground ----------------------------------------------------------------------------------------------------

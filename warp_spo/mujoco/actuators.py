@@ -127,19 +127,22 @@ def _transmission(source: Source, actuator: int) -> dict[int, float]:
 
 
 def _force_ranges(source: Source, joints: list[dict[int, float]]) -> list[tuple[float, float]]:
-    """Return the range of each actuator's force, narrowed by ``actuatorfrcrange`` of a joint that it alone drives."""
+    """Return the range of each actuator's force, narrowed by an uneven ``actuatorfrcrange`` of a joint that it alone
+    drives. An even one is the joint's effort limit, which bounds the sum of its actuators."""
     m = source.model
     ranges = [
         tuple(m.actuator_forcerange[actuator].tolist()) if m.actuator_forcelimited[actuator] else UNBOUNDED
         for actuator in range(len(joints))
     ]
     for joint in np.flatnonzero(m.jnt_actfrclimited):
+        if m.jnt_actfrcrange[joint, 0] == -m.jnt_actfrcrange[joint, 1]:
+            continue
         own = [actuator for actuator, gears in enumerate(joints) if gears.get(int(joint))]
         if len(own) > 1 or any(len(joints[actuator]) > 1 for actuator in own):
             source.refuse(
-                f"{source.words('joint', int(joint))}, whose actuatorfrcrange bounds the sum of several actuators or "
-                "one of several joints of a tendon,",
-                "remove it, and write forcerange on the actuators",
+                f"{source.words('joint', int(joint))}, whose uneven actuatorfrcrange bounds the sum of several "
+                "actuators or one of several joints of a tendon,",
+                "let its ends be opposite numbers, or write forcerange on the actuators",
             )
         for actuator in own:
             low, high = sorted(m.jnt_actfrcrange[joint] / joints[actuator][int(joint)])

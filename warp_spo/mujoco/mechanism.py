@@ -156,7 +156,7 @@ class Mechanism:
             values |= {"limit_lower": lower, "limit_upper": upper, "limit_ke": ke, "limit_kd": kd}
         low, high = m.jnt_actfrcrange[joint]
         if m.jnt_actfrclimited[joint] and low == -high:
-            values["effort_limit"] = high  # of drives whose gains are set later; the file's actuators are bounded apart
+            values["effort_limit"] = high
         return values
 
     def _actuator_values(self, joint: int) -> dict[str, float]:

@@ -28,6 +28,8 @@ from .rotations import (
 )
 from .rotors import Rotors, moving
 
+NO_EFFORT_LIMIT = 1e6  # effort limits of this size and more are none
+
 __all__ = [
     "Dense",
     "homogeneous",
@@ -363,7 +365,7 @@ class Dense(Motion):
         return force
 
     def actuator_force(self, qd, ctrl):
-        """Return the forces of the scene's actuators for the controls ``ctrl`` [dof]."""
+        """Return the forces of the scene's actuators for the controls ``ctrl``, within joints' effort limits [dof]."""
         qd, tau, first = self._qd(qd), np.zeros(self.dof_count), 0
         of = {name: self.value(f"actuator_{name}") for name in ("gain", "bias", "gear", "strength")}
         ends = {name: self.value(f"actuator_{name}_range") for name in ("ctrl", "force")}
@@ -382,4 +384,5 @@ class Dense(Motion):
                 slip = state[2] / no_load
                 force = np.clip(force, min(-stall * (1.0 + slip), 0.0), max(stall * (1.0 - slip), 0.0))
             tau[dofs] += of["strength"][a] * gear * force
-        return tau
+        limit = self.value("joint_effort_limit")
+        return np.where(limit < NO_EFFORT_LIMIT, np.clip(tau, -limit, limit), tau)

@@ -46,7 +46,8 @@ class Actuator:
 
         f = strength clip(gain clip(ctrl, ctrl_range) + bias[0] + bias[1] l + bias[2] l', force_range)
 
-    and it adds ``gear_i f`` to the force tau of each of its hinges. A motor has gain 1 and no bias. A position servo
+    and it adds ``gear_i f`` to the force tau of each of its hinges; what all actuators of a hinge and its drive give
+    together is at most the hinge's ``effort_limit``. A motor has gain 1 and no bias. A position servo
     has gain kp and bias (0, -kp, -kv). A velocity servo has gain kv and bias (0, 0, -kv).
 
     Args:

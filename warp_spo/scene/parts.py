@@ -140,7 +140,8 @@ class Hinge(StoredPart):
         limit_upper: upper position limit [rad or m].
         limit_ke: stiffness of the position limits [N m or N/m].
         limit_kd: damping of the position limits [N m s or N s/m].
-        effort_limit: bound of the drive's force [N m or N].
+        effort_limit: bound of the force of drive and actuators together [N m or N]; 1e6 and more is none. It does not
+            bound tau.
         velocity_limit: bound of the velocity [rad/s or m/s].
         rest: coordinates at which the spring is relaxed, one per coordinate.
         rotor: a :class:`Rotor` that turns with the hinge through a gear; one degree of freedom, or flexible.

@@ -2,7 +2,8 @@
 
     f = strength clip(gain clip(ctrl, ctrl_range) + bias0 + bias1 l + bias2 l', force_range),
 
-within the torque-speed curve where there is one; each hinge receives gear_i f. See :class:`warp_spo.Actuator`.
+within the torque-speed curve where there is one; each hinge receives gear_i f, and of all its actuators together no
+more than its effort limit. See :class:`warp_spo.Actuator`.
 
 In a time step these forces are laws of the dofs, see :mod:`.joint_laws`. On one hinge, bias1 and bias2 below zero are a
 spring and a damper, which are implicit like those of a drive, between bounds at the rate before the step. All else is
@@ -21,7 +22,7 @@ import numpy as np
 from ...trace.emission import Store
 from ...trace.scalars import Value, absolute, is_constant, less, select
 from ...trace.spatial import total
-from .joint_laws import JointLaws, Law, is_number
+from .joint_laws import JointLaws, Law, clip, is_number
 
 if TYPE_CHECKING:
     from ..model.links import Links
@@ -109,6 +110,17 @@ class Actuation:
     def force(self, number: int) -> Value:
         """Return the force of an actuator before its strength and gear."""
         return self.push(number, lambda one: self.q(one.coordinate), 0.0).force
+
+    def reach(self, dof: int) -> float:
+        """Return the largest force on a dof within constant ranges of its actuators; infinite where one is not."""
+        most = 0.0
+        for number, one in self.acting.get(dof, ()):
+            ends = self.bounds("actuator_force_range", number)
+            factors = [one.gear, self.value("actuator_strength", number)]
+            if not all(isinstance(x, float) for x in (*ends, *factors)):
+                return INFINITY
+            most += abs(factors[0] * factors[1]) * max(map(abs, ends))  # type: ignore[arg-type, operator]
+        return most
 
     def push(self, number: int, coordinate: Callable[[Moved], Value], h: Value) -> Push:
         """Return the force at the given coordinates, and its slope where the force may be implicit over ``h``."""
@@ -212,15 +224,6 @@ def build_joint_laws(trace: Trace, h: Value) -> JointLaws:
     )
 
 
-def clip(x: Value, low: Value | None, high: Value | None) -> Value:
-    """Return ``x`` between two bounds; None is no bound."""
-    if high is not None:
-        x = select(less(high, x), high, x)
-    if low is not None:
-        x = select(less(x, low), low, x)
-    return x
-
-
 def outside(x: Value, low: Value | None, high: Value | None) -> Value:
     """Return non-zero where ``x`` is beyond a bound; None is no bound."""
     return (0.0 if high is None else less(high, x)) + (0.0 if low is None else less(x, low))
@@ -232,8 +235,9 @@ def below_zero(x: Value) -> Value:
 
 
 def actuator_force(trace: Trace) -> list[Store]:
-    """out = the forces tau of all actuators at q, qd and ctrl"""
+    """out = the forces tau of all actuators at q, qd and ctrl, within the effort limits"""
     actuation = Actuation(trace.links, trace.vector("ctrl"), trace.vector("q"), trace.vector("qd"))
+    joint_laws = JointLaws(trace.links, 0.0, trace.vector("q"), trace.vector("qd"))
     strong = [
         actuation.value("actuator_strength", number) * actuation.force(number) for number in range(len(actuation.moved))
     ]
@@ -241,6 +245,7 @@ def actuator_force(trace: Trace) -> list[Store]:
     for link in trace.links.leaders:
         trace.label(link, "a")
         for dof in link.dofs:
-            forces = (one.gear * strong[number] for number, one in actuation.acting.get(dof, ()))
-            stores.append(Store("out", (dof,), total(forces)))
+            force = total(one.gear * strong[number] for number, one in actuation.acting.get(dof, ()))
+            most = None if joint_laws.is_weak(dof, actuation.reach(dof)) else joint_laws.effort_limit(dof)
+            stores.append(Store("out", (dof,), force if most is None else clip(force, -most, most)))
     return stores

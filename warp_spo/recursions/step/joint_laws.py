@@ -1,4 +1,4 @@
-"""Forces of the hinges in a time step: springs, dampers, drives, limits and friction, all implicit.
+"""Forces of the hinges in a time step: springs, dampers, drives, actuators, limits and friction, all implicit.
 
 A step of h seconds takes qd to qd' = qd + u and moves q along h qd'. The force of every law of a dof is a linear
 function of u between two bounds,
@@ -8,6 +8,8 @@ function of u between two bounds,
 that does not increase with u. Each of its three pieces is linear, so that an armature h resistance and a force make it
 implicit: (Mass + h R) qdd = tau - bias_force + F, u = h qdd. The active piece is guessed and checked afterwards, a
 semismooth Newton iteration that is exact once the guess is right.
+
+A hinge's effort limit bounds what its motor gives, the sum of its drive and its actuators.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ DEFAULT_BOUND = 1e6  # effort and velocity limits of this size and more are no l
 HOLD = 300.0  # resistance of a velocity limit, in inertias / h; the excess over the limit shrinks by this factor
 FREE = 1e20  # bound that no force or rate reaches, in place of a variable one of DEFAULT_BOUND and more
 LIMIT, FRICTION = "limit", "friction"  # roles of laws
+LEAST_SCALE = 1e-8  # strength times gear below which a force is nothing; its inverse square is in range of float32
 NOISE = 4.0  # roundings of a law's terms; two pieces may differ by so much where they meet
 
 
@@ -127,6 +130,53 @@ def add_laws(laws: list[Law]) -> Law:
     return Law(total(law.force for law in laws), total(law.resistance for law in laws))
 
 
+def clip(x: Value, low: Value | None, high: Value | None) -> Value:
+    """Return ``x`` between two bounds; None is no bound."""
+    if high is not None:
+        x = select(less(high, x), high, x)
+    if low is not None:
+        x = select(less(x, low), low, x)
+    return x
+
+
+def limit_sum(laws: list[Law], bound: Value) -> list[Law]:
+    """Return laws whose sum is that of ``laws``, held between -``bound`` and ``bound``.
+
+    Exact where no law has bounds of its own, or one has and the others have no resistance. Otherwise the active pieces
+    are those at u = 0, and their sum is held.
+    """
+    if not laws or is_number(bound, 0.0):
+        return []
+    loose, own = add_laws([law for law in laws if not law.has_bounds]), [law for law in laws if law.has_bounds]
+    if len(own) == 1 and is_number(loose.resistance, 0.0):
+        return [_share(own[0], loose.force, bound), *([] if is_number(loose.force, 0.0) else [loose])]
+    whole = add_laws([loose, *(law.piece(0.0) for law in own)]) if own else loose
+    if is_number(whole.resistance, 0.0):
+        return [whole._replace(force=clip(whole.force, -bound, bound))]
+    return [whole._replace(least=-bound, most=bound, symmetric=True)]
+
+
+def _share(law: Law, beside: Value, bound: Value) -> Law:
+    """Return a law with bounds that keep its sum with the force ``beside`` between -``bound`` and ``bound``, too."""
+    weight = reciprocal(select(less(LEAST_SCALE, law.scale), law.scale, LEAST_SCALE))
+    low, high = (end * weight for end in (-bound - beside, bound - beside))
+    least, most = law.least, law.most
+    even = isinstance(least, float) and isinstance(most, float) and least == -most
+    return law._replace(
+        least=low if least is None else clip(least, low, high),
+        most=high if most is None else clip(most, low, high),
+        symmetric=is_number(beside, 0.0) and (law.symmetric or even),
+    )
+
+
+def reach(laws: list[Law]) -> float:
+    """Return a bound of the size of the sum of laws, from bounds that are constants; infinite where one is not."""
+    ends = [(law.scale, law.least, law.most) for law in laws]
+    if not all(isinstance(x, float) for end in ends for x in end):
+        return np.inf
+    return sum(scale * max(abs(least), abs(most)) for scale, least, most in ends)  # type: ignore[arg-type, misc]
+
+
 class JointLaws:
     """The laws of every dof of a scene for one step.
 
@@ -160,8 +210,13 @@ class JointLaws:
         every = []
         for i, dof in enumerate(link.dofs):
             unbounded = [*self._damper(dof), *self._spring(link, i, "joint_stiffness", self._rest)]
-            found = [*self._drive(link, i), *self._limits(link, i), *self._friction(dof)]
-            found += self.actuators(dof)
+            drive, actuators = self._drive(link, i), self.actuators(dof)
+            effort = self.effort_limit(dof) if drive or actuators else None
+            if effort is not None and actuators and (drive or not self.is_weak(dof, reach(actuators))):
+                drive, actuators = [], limit_sum(drive + actuators, effort)
+            elif effort is not None:
+                drive = limit_sum(drive, effort)
+            found = [*drive, *self._limits(link, i), *self._friction(dof), *actuators]
             found += self._rate_limit(dof, unbounded + found)
             unbounded += [law for law in found if not law.has_bounds]
             every.append([add_laws(unbounded)] * bool(unbounded) + [law for law in found if law.has_bounds])
@@ -213,6 +268,15 @@ class JointLaws:
         some = name in self.links.variable or (self.scene.values[name][:, dof] >= DEFAULT_BOUND).any()
         return select(less(bound, DEFAULT_BOUND), bound, FREE) if bound is not None and some else bound
 
+    def effort_limit(self, dof: int) -> Value | None:
+        """Return the bound of the force that drive and actuators of a dof give together; None if there is none."""
+        return self._most("joint_effort_limit", dof)
+
+    def is_weak(self, dof: int, most: float) -> bool:
+        """Return whether a force of the size ``most`` obeys the effort limit of a dof in all worlds, for good."""
+        name = "joint_effort_limit"
+        return name not in self.links.variable and bool((self.scene.values[name][:, dof] >= most).all())
+
     def _rest(self, coordinate: int) -> Value:
         return self.value("joint_rest_q", coordinate)
 
@@ -242,17 +306,12 @@ class JointLaws:
         return link.hinge.displacement(i, lambda c: self.q(first + c), lambda c: rest(first + c))
 
     def _drive(self, link: Link, i: int) -> list[Law]:
-        """ke (target_q - q') + kd (target_qd - qd'), within the effort limit."""
+        """ke (target_q - q') + kd (target_qd - qd')"""
         dof = link.dofs[i]
         kd = self.value("joint_target_kd", dof)
         laws = self._spring(link, i, "joint_target_ke", self.target_q)
         laws += [] if is_number(kd, 0.0) else [Law(kd * (self.target_qd(dof) - self.qd(dof)), kd)]
-        if not laws:
-            return []
-        effort, law = self._most("joint_effort_limit", dof), add_laws(laws)
-        if effort is not None and is_number(effort, 0.0):
-            return []
-        return [law] if effort is None else [law._replace(least=-effort, most=effort, symmetric=True)]
+        return [add_laws(laws)] if laws else []
 
     def _limits(self, link: Link, i: int) -> list[Law]:
         """Return springs that push back into the range and never pull; outside the range with dampers."""
