@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import functools
+import math
 import warnings
 from pathlib import Path
 from typing import Any
 
 import newton
 import numpy as np
+from newton.usd import SchemaResolverNewton
 
 from ...errors import UnsupportedError
 from ...scene.collision_shapes import NONE, CollisionShape, ShapeSelection
@@ -18,6 +20,15 @@ from ..model import from_newton
 from ..model_contacts import ModelShapes
 from ..worlds import WorldRows, quote_labels
 from .inertia_repair import repair_bodies
+from .usd_attributes import left_out
+from .usd_stage import check_nesting, check_numbers, prepare
+from .usd_values import (
+    ImportedJoints,
+    VendorAttributes,
+    weights_held_up,
+    with_scaled_drives,
+    with_weightless_bodies,
+)
 
 DIMENSIONS = {
     "joint_limit_lower": ((0, 1), (0, 0)),
@@ -37,47 +48,84 @@ DIMENSIONS = {
 
 
 def read_usd(file: Path, floating: bool | None, repair: bool, selection: ShapeSelection = NONE) -> Scene:
-    """Return the scene of a USD file, in SI units.
+    """Return the scene of a USD file, in SI units; one warning names what the file says and a scene does not have.
 
     Raises:
         UnsupportedError: Newton's importer loses a body, as it does if the only joint that carries the body has
-            ``excludeFromArticulation``.
+            ``excludeFromArticulation``; or a joint has no counterpart, as :func:`prepare` and :class:`ImportedJoints`
+            say.
     """
     from pxr import Usd, UsdGeom, UsdPhysics  # an ImportError names the extra
 
-    builder = newton.ModelBuilder()
+    builder, call = newton.ModelBuilder(), f"load: {str(file)!r}"
+    check_nesting(file)
     try:
         stage = Usd.Stage.Open(str(file))
         stage.Reload()  # layers stay in memory as long as a stage has them
-        metre, kilogram = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
+    except Exception as error:
+        raise unreadable(file, error) from error
+    metre, kilogram = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
+    if not (0.0 < metre < math.inf and 0.0 < kilogram < math.inf):
+        raise ValueError(f"{call}: metersPerUnit is {metre}, kilogramsPerUnit {kilogram}; expected finite ones above 0")
+    check_numbers(call, stage)
+    prepare(call, stage)
+    try:
         builder.default_shape_cfg.density *= metre**3 / kilogram  # the importer computes in the stage's units
         builder.default_shape_cfg.mu = Contact.friction  # of shapes without a material
-        found = builder.add_usd(str(file), floating=floating, load_visual_shapes=False, skip_mesh_approximation=True)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "USD stages with non-unit", newton.NewtonWarning)  # converted below
+            found = builder.add_usd(
+                stage,
+                floating=floating,
+                load_visual_shapes=False,
+                skip_mesh_approximation=True,
+                schema_resolvers=[SchemaResolverNewton(), VendorAttributes()],
+            )
     except ImportError:
         raise
     except Exception as error:
         raise unreadable(file, error) from error
     if builder.body_count == 0:
-        raise ValueError(f"load: {str(file)!r} has no rigid bodies; expected prims with PhysicsRigidBodyAPI")
+        raise ValueError(f"{call} has no rigid bodies; expected prims with PhysicsRigidBodyAPI")
+    joints = ImportedJoints(call, stage, builder, found["path_joint_map"])
+    joints.turn_offsets_of_mimics()
+    accelerated = joints.accelerated()
     if (metre, kilogram) != (1.0, 1.0):
-        _convert(builder, metre, kilogram, gravity=found.get("physics_scene_path") is not None)
+        _convert(builder, metre, kilogram, found.get("physics_scene_path") is not None, accelerated)
+    _refuse_lost_bodies(call, stage, builder)
+    scene = scene_of(file, builder, repair, selection)
+    scene = with_scaled_drives(call, scene, accelerated)
+    scene = with_weightless_bodies(scene, weights_held_up(stage))
+    words = []
+    stage.GetSessionLayer().Clear()  # the file's own words count from here
+    loops, labels = {loop.label for loop in scene.loops}, builder.joint_label
+    of_loops = {path for path, joint in found["path_joint_map"].items() if labels[joint] in loops}
+    words += left_out(
+        stage, of_loops, set(found["path_joint_map"]), found["physics_scene_path"], selection.contacts is not None
+    )
+    if words:
+        warnings.warn(f"{call}: left out: {'; '.join(words)}", UserWarning, stacklevel=3)
+    return scene
+
+
+def _refuse_lost_bodies(call: str, stage: Any, builder: newton.ModelBuilder) -> None:
+    """Raise UnsupportedError if the importer left out a body, or made one that no joint carries."""
     read = set(builder.body_label)
     lost = [path for path in _rigid_bodies(stage) if path not in read]
     if lost:
         raise UnsupportedError(
-            "load",
-            f"{str(file)!r} with bodies that Newton's importer leaves out ({quote_labels(lost)})",
+            call,
+            f"bodies that Newton's importer leaves out ({quote_labels(lost)})",
             "give each a joint without excludeFromArticulation, or take it out of the articulation root",
         )
     carried = set(builder.joint_child)
     loose = [label for body, label in enumerate(builder.body_label) if body not in carried]
     if loose:
         raise UnsupportedError(
-            "load",
-            f"{str(file)!r} with bodies that are body1 of no joint ({quote_labels(loose)})",
+            call,
+            f"bodies that are body1 of no joint ({quote_labels(loose)})",
             "join each to the world by a joint without body0, or put an articulation root above them all",
         )
-    return scene_of(file, builder, repair, selection)
 
 
 def _rigid_bodies(stage: Any) -> list[str]:
@@ -88,13 +136,16 @@ def _rigid_bodies(stage: Any) -> list[str]:
     return [str(body.GetPath()) for body in bodies if body.GetRigidBodyEnabledAttr().Get()]
 
 
-def _convert(builder: newton.ModelBuilder, metre: float, kilogram: float, gravity: bool) -> None:
+def _convert(
+    builder: newton.ModelBuilder, metre: float, kilogram: float, gravity: bool, accelerated: list[int]
+) -> None:
     """Convert the builder's values from a stage's units to metres and kilograms.
 
     Args:
         builder: what the importer made; its gravity is that of the stage if ``gravity`` says so, in the stage's units.
         metre, kilogram: the stage's unit of length [m] and of mass [kg].
         gravity: whether the stage has a gravity.
+        accelerated: dofs whose drive's gains are accelerations, in which no unit remains.
     """
     values: Any = builder
     values.body_mass[:] = [kilogram * mass for mass in values.body_mass]
@@ -115,6 +166,8 @@ def _convert(builder: newton.ModelBuilder, metre: float, kilogram: float, gravit
         column, unset = getattr(values, name), getattr(default, name.removeprefix("joint_"))
         for dof, slide in enumerate(slides):
             mass, length = powers[0] if slide else powers[1]
+            if name in ("joint_target_ke", "joint_target_kd") and dof in accelerated:
+                continue
             if column[dof] != unset:  # a default is one in SI units
                 column[dof] *= kilogram**mass * metre**length
     length_of = [metre if linear else 1.0 for linear, _ in values.joint_dof_dim]

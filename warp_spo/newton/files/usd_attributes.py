@@ -1,0 +1,223 @@
+"""Attributes of physics in USD: which a scene takes up, which say nothing about a robot, and which are left out.
+
+A prim has parts: it is a body, a shape, a material, the scene, or a joint of some type. ``READ`` names what each part
+gives. Whatever else a file writes in the schemas of physics, with another value than the schema's own, is named in
+the warning of :func:`left_out`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from ...errors import shown
+from .usd_stage import AXES, all_prims, applied_schemas, is_physical, matches
+
+Names = tuple[str, ...]
+MASS: dict[str, Names] = {
+    "PhysicsMassAPI": (
+        "physics:mass", "physics:density", "physics:centerOfMass", "physics:diagonalInertia", "physics:principalAxes",
+    )
+}  # fmt: skip
+JOINT: dict[str, Names] = {
+    "": (
+        "physics:body0", "physics:body1", "physics:localPos0", "physics:localPos1", "physics:localRot0",
+        "physics:localRot1", "physics:jointEnabled", "physics:excludeFromArticulation",
+    )
+}  # fmt: skip
+DOFS: Names = (
+    "newton:armature", "newton:damping", "newton:friction", "mjc:armature", "mjc:damping", "mjc:stiffness",
+    "mjc:frictionloss", "physxJoint:armature",
+)  # fmt: skip
+LIMITS: Names = ("newton:velocityLimit", "physxJoint:maxJointVelocity", "newton:limitStiffness", "newton:limitDamping")
+SINGLE: Names = (
+    "mjc:ref", "mjc:springref", "mjc:actuatorfrcrange:min", "mjc:actuatorfrcrange:max", "mjc:actuatorfrclimited",
+    "physics:axis", "physics:lowerLimit", "physics:upperLimit",
+)  # fmt: skip
+GEARS: dict[str, Names] = {
+    "NewtonMimicAPI": ("newton:mimicEnabled", "newton:mimicJoint", "newton:mimicCoef0", "newton:mimicCoef1"),
+    "MjcEqualityJointAPI": ("newton:mimic*", "mjc:target", "mjc:coef0", "mjc:coef1"),
+    "PhysxMimicJointAPI:*": tuple(f"physxMimicJoint:*:{name}" for name in ("referenceJoint*", "gearing", "offset")),
+}
+
+
+def _axis(name: str, limited: bool) -> dict[str, Names]:
+    """Return what a joint reads of one axis: its drive, its soft limit, and if ``limited`` its limit."""
+    drive = tuple(f"drive:{name}:physics:{value}" for value in ("type", "stiffness", "damping", "maxForce"))
+    read = {f"PhysicsDriveAPI:{name}": drive, "": (f"physxLimit:{name}:stiffness", f"physxLimit:{name}:damping")}
+    return read | ({f"PhysicsLimitAPI:{name}": (f"limit:{name}:physics:*",)} if limited else {})
+
+
+def _joined(*parts: Mapping[str, Names]) -> dict[str, Names]:
+    """Return all names of several tables, by the schema that they need."""
+    return {api: sum((part.get(api, ()) for part in parts), ()) for part in parts for api in part}
+
+
+READ: dict[str, dict[str, Names]] = {
+    "scene": {"": ("physics:gravityDirection", "physics:gravityMagnitude", "newton:gravityEnabled")},
+    "body": MASS
+    | {
+        "": ("physics:rigidBodyEnabled", "physics:kinematicEnabled", "physxRigidBody:disableGravity", "mjc:gravcomp"),
+        "NewtonMassAPI": ("newton:inertia",),
+    },
+    "shape": MASS | {"": ("physics:collisionEnabled", "newton:massModel", "newton:shellThickness", "mjc:shellinertia")},
+    "material": {"": ("physics:density",)},
+    "PhysicsFixedJoint": _joined(JOINT, {"": ("physxJoint:*", "physics:axis", "physics:*Limit")}),
+    "PhysicsRevoluteJoint": _joined(JOINT, GEARS, {"": DOFS + LIMITS + SINGLE}, _axis("angular", False)),
+    "PhysicsPrismaticJoint": _joined(JOINT, GEARS, {"": DOFS + LIMITS + SINGLE}, _axis("linear", False)),
+    "PhysicsSphericalJoint": _joined(JOINT, {"": ("physics:axis", *DOFS)}),
+    "PhysicsJoint": _joined(JOINT, {"": DOFS + LIMITS}, *(_axis(name, True) for name in AXES)),
+    "PhysicsDistanceJoint": _joined(JOINT, {"": ("physics:minDistance", "physics:maxDistance")}),
+    "loop": _joined(JOINT, {"": ("physics:axis", "mjc:torqueScale")}),
+}  # fmt: skip
+"""Attributes that a scene takes up, as patterns: by the part of a prim and the applied schema that they need."""
+
+SYNONYMS = (
+    ("newton:armature", "mjc:armature", "physxJoint:armature"),
+    ("newton:damping", "mjc:damping"),
+    ("newton:friction", "mjc:frictionloss"),
+    ("newton:velocityLimit", "physxJoint:maxJointVelocity"),
+    ("newton:massModel", "mjc:shellinertia"),
+    *(("newton:limitStiffness", f"physxLimit:{name}:stiffness") for name in ("linear", "angular", *AXES)),
+    *(("newton:limitDamping", f"physxLimit:{name}:damping") for name in ("linear", "angular", *AXES)),
+)
+"""Names of one value in several schemas: the first that a joint has counts."""
+
+OF_SOLVERS = (
+    "physxScene:*", "newton:xpbd:*", "newton:kamino:*", "newton:vbd:*", "newton:mpm:*", "newton:maxSolverIterations",
+    "newton:timeStepsPerSecond", "physxArticulation:*Count", "physxArticulation:*Threshold", "physxRigidBody:*Count",
+    "physxRigidBody:*Threshold", "physxRigidBody:max*", "physxRigidBody:enable*CCD", "physxRigidBody:contactSlop*",
+    "physxRigidBody:retainAccelerations", "physxRigidBody:solveContact", "physxJoint:enableProjection",
+    "mjc:option:*", "mjc:compiler:*", "mjc:group", "physics:simulationOwner", "physics:startsAsleep", "physics:engine",
+    "physics:tensor:*", "newton:collapse_fixed_joints", "newton:joint_drive_gains_scaling",
+)  # fmt: skip
+"""Settings of solvers, viewers and importers; a scene has none."""
+OF_FLUIDS = ("mjc:option:density", "mjc:option:viscosity", "mjc:option:wind", "mjc:option:magnetic")
+"""Options of MuJoCo that exert forces."""
+
+OF_CONTACT = (
+    "physics:staticFriction", "physics:dynamicFriction", "physics:restitution", "physics:collisionEnabled",
+    "physics:approximation", "physics:filtered*", "physics:invertFilteredGroups", "physics:mergeGroup",
+    "newton:contact*", "newton:torsionalFriction", "newton:rollingFriction", "newton:sdf*", "newton:hydroelastic*",
+    "newton:maxHullVertices", "newton:selfCollisionEnabled", "physxCollision*:*", "physxMaterial:*", "physxConvex*:*",
+    "physxSDFMesh*:*", "physxTriangleMesh*:*", "physxCooked*:*", "physxArticulation:enabledSelfCollisions",
+    "mjc:condim", "mjc:solref", "mjc:solimp", "mjc:solmix", "mjc:priority", "mjc:margin", "mjc:gap", "mjc:contype",
+    "mjc:conaffinity", "mjc:torsionalfriction", "mjc:rollingfriction", "mjc:slidingfriction", "mjc:maxhullvert",
+)  # fmt: skip
+"""Attributes of contact, which matter if the caller asks for contacts."""
+CONTACT_READ: Names = (
+    "physics:dynamicFriction", "physics:collisionEnabled", "physics:approximation", "physics:filtered*",
+    "newton:contactMargin", "physics:invertFilteredGroups", "physics:mergeGroup",
+)  # fmt: skip
+SOFT = {"solref": (0.02, 1.0), "solimp": (0.9, 0.95, 0.001, 0.5, 2.0)}
+NEUTRAL: dict[str, tuple[Any, ...]] = {
+    "mjc:flag:*": (True,),
+    "mjc:*limited": ("auto",),
+    "mjc:*Limited": ("auto",),
+    "mjc:solref*": (SOFT["solref"],),
+    "mjc:solimp*": (SOFT["solimp"],),
+    "mjc:condim": (3,),
+    "mjc:solmix": (1.0,),
+    "mjc:contype": (1,),
+    "mjc:conaffinity": (1,),
+    "physxRigidBody:enableGyroscopicForces": (True,),
+    "physxArticulation:enabledSelfCollisions": (True,),
+    "physxArticulation:articulationEnabled": (True,),
+    "physxLimit:*:bounceThreshold": (),
+    "physxCollision:contactOffset": (float("-inf"),),
+    "physxCollision:restOffset": (float("-inf"),),
+}
+"""Values that mean nothing, of attributes that no schema at hand defines; of others it is zero, false or empty."""
+UNBOUNDED = 1e30
+"""What is above is without bound: files write the largest number of float32 for it."""
+MOST = 24
+"""Names of attributes in one warning."""
+
+
+def left_out(stage: Any, loops: set[str], joints: set[str], scene_path: str | None, contacts: bool) -> list[str]:
+    """Return in words what a stage says of physics and a scene does not take up, each attribute with a prim.
+
+    Args:
+        stage: as the file has it. loops: paths of joints that became loops. joints: of all that became hinges or
+            loops. scene_path: of the scene whose gravity counts. contacts: whether attributes of contact matter.
+    """
+    found: dict[str, list[str]] = {}
+    for prim in all_prims(stage):
+        path = str(prim.GetPath())
+        for what in _unread(prim, path, loops, joints, scene_path, contacts):
+            found.setdefault(what, []).append(path)
+    words = [f"{shown(what)} ({_places(paths)})" for what, paths in found.items()]
+    return words[:MOST] + ([f"and {len(words) - MOST} more attributes"] if len(words) > MOST else [])
+
+
+def _places(paths: list[str]) -> str:
+    first = shown(paths[0])
+    return first if len(paths) == 1 else f"{first} and {len(paths) - 1} more"
+
+
+def _unread(
+    prim: Any, path: str, loops: set[str], joints: set[str], scene_path: str | None, contacts: bool
+) -> Iterator[str]:
+    """Yield what a scene does not take up of a prim: names of attributes, or of the prim's type."""
+    from pxr import UsdPhysics
+
+    kind, schemas = str(prim.GetTypeName()), applied_schemas(prim)
+    if kind.startswith("Mjc") or kind == "NewtonActuator":
+        yield f"{kind}s"
+        return
+    if "MjcSiteAPI" in schemas or "NewtonSiteAPI" in schemas:
+        yield "sites"
+        return
+    if prim.IsA(UsdPhysics.Joint):
+        if not prim.GetAttribute("physics:jointEnabled").Get():
+            return
+        if path not in joints:
+            yield "joints"
+            return
+    parts = [kind] if kind in READ else []
+    parts = ["loop"] if path in loops else parts
+    parts += ["scene"] if kind == "PhysicsScene" and path == scene_path else []
+    parts += [
+        part
+        for part, schema in {"body": "RigidBodyAPI", "shape": "CollisionAPI", "material": "MaterialAPI"}.items()
+        if f"Physics{schema}" in schemas
+    ]
+    read: Names = CONTACT_READ if contacts else OF_CONTACT
+    for part in parts:
+        for api, names in READ[part].items():
+            if not api or any(matches(schema, (api,)) for schema in schemas):
+                read += names
+    written = [attribute for attribute in prim.GetAuthoredProperties() if is_physical(attribute.GetName())]
+    values = {attribute.GetName(): attribute for attribute in written}
+    beaten = {name for group in SYNONYMS for name in [one for one in group if one in values][1:]}
+    if not _is_symmetric(values):
+        beaten |= {"mjc:actuatorfrcrange:min", "mjc:actuatorfrcrange:max"}
+    for name, attribute in values.items():
+        if matches(name, OF_SOLVERS) and name not in OF_FLUIDS:
+            continue
+        if (name in beaten or not matches(name, read)) and not _says_nothing(prim, attribute):
+            yield name
+
+
+def _is_symmetric(values: Mapping[str, Any]) -> bool:
+    """Return whether a joint's range of actuator forces, if it has one, is as wide on both sides."""
+    bounds = [values.get(f"mjc:actuatorfrcrange:{end}") for end in ("min", "max")]
+    low, high = (float(bound.Get() or 0.0) if bound else 0.0 for bound in bounds)
+    return low == -high
+
+
+def _says_nothing(prim: Any, attribute: Any) -> bool:
+    """Return whether an attribute has the value that it would have if the file did not write it."""
+    name = attribute.GetName()
+    if hasattr(attribute, "GetTargets"):
+        return not attribute.GetTargets()
+    value = attribute.Get()
+    if value is None:
+        return not attribute.GetNumTimeSamples()  # a value that changes with time has no one value
+    own = prim.GetPrimDefinition().GetAttributeFallbackValue(name)
+    if own is not None:
+        return bool(value == own) or (own == math.inf and value > UNBOUNDED)
+    neutral = [one for pattern, values in NEUTRAL.items() if matches(name, (pattern,)) for one in values]
+    plain = tuple(value) if hasattr(value, "__len__") and not isinstance(value, str) else value
+    return plain in neutral if neutral else not (any(plain) if isinstance(plain, tuple) else plain)
