@@ -196,8 +196,14 @@ def _unread(
     for name, attribute in values.items():
         if matches(name, OF_SOLVERS) and name not in OF_FLUIDS:
             continue
-        if (name in beaten or not matches(name, read)) and not _says_nothing(prim, attribute):
+        taken = matches(name, read) and name not in beaten and not _changes(attribute)
+        if not taken and not _says_nothing(prim, attribute):
             yield name
+
+
+def _changes(attribute: Any) -> bool:
+    """Return whether an attribute has values at times alone; no one value is that of a scene."""
+    return not hasattr(attribute, "GetTargets") and attribute.Get() is None and attribute.GetNumTimeSamples() > 0
 
 
 def _is_symmetric(values: Mapping[str, Any]) -> bool:
@@ -214,7 +220,7 @@ def _says_nothing(prim: Any, attribute: Any) -> bool:
         return not attribute.GetTargets()
     value = attribute.Get()
     if value is None:
-        return not attribute.GetNumTimeSamples()  # a value that changes with time has no one value
+        return not _changes(attribute)
     own = prim.GetPrimDefinition().GetAttributeFallbackValue(name)
     if own is not None:
         return bool(value == own) or (own == math.inf and value > UNBOUNDED)

@@ -110,7 +110,7 @@ def check_numbers(call: str, stage: Any) -> None:
             if is_physical(attribute.GetName()):
                 value = attribute.Get()
                 try:
-                    numbers = np.array(value, dtype=np.float64)
+                    numbers = np.array(0.0 if value is None else value, dtype=np.float64)
                 except (TypeError, ValueError):
                     continue  # no number
                 infinite = np.isinf(numbers).any() and not matches(attribute.GetName(), INFINITE)

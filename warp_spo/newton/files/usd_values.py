@@ -238,6 +238,8 @@ def weights_held_up(stage: Any) -> dict[str, float]:
     """Return the share of its weight that holds up each body of which a file writes one, by its path."""
     shares = {}
     for prim in all_prims(stage):
+        if not prim.HasAPI("PhysicsRigidBodyAPI"):
+            continue
         off = 1.0 if authored(prim, "physxRigidBody:disableGravity") else authored(prim, "mjc:gravcomp")
         if off is not None:
             shares[str(prim.GetPath())] = float(off)
