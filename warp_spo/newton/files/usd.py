@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 import warnings
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import newton
 import numpy as np
 from newton.usd import SchemaResolverNewton
 
-from ...errors import UnsupportedError
+from ...errors import UnsupportedError, shown
 from ...scene.collision_shapes import NONE, CollisionShape, ShapeSelection
 from ...scene.contacts import Contact
 from ...scene.scene import Scene
@@ -21,7 +20,7 @@ from ..model_contacts import ModelShapes
 from ..worlds import WorldRows, quote_labels
 from .inertia_repair import repair_bodies
 from .usd_attributes import left_out
-from .usd_stage import check_nesting, check_numbers, prepare
+from .usd_stage import check_nesting, check_values, prepare
 from .usd_values import (
     ImportedJoints,
     VendorAttributes,
@@ -30,6 +29,10 @@ from .usd_values import (
     with_weightless_bodies,
 )
 
+UNITS = (1e-9, 1e9)
+"""Least and largest unit of length [m] and of mass [kg] of a file."""
+MOST = 600
+"""Characters of the words of an importer's error."""
 DIMENSIONS = {
     "joint_limit_lower": ((0, 1), (0, 0)),
     "joint_limit_upper": ((0, 1), (0, 0)),
@@ -55,36 +58,36 @@ def read_usd(file: Path, floating: bool | None, repair: bool, selection: ShapeSe
             ``excludeFromArticulation``; or a joint has no counterpart, as :func:`prepare` and :class:`ImportedJoints`
             say.
     """
+    call = f"load: {str(file)!r}"
+    try:
+        scene, words = _read(file, call, floating, repair, selection)
+    except (ImportError, Warning):
+        raise
+    except Exception as error:  # an importer raises errors of any type for a damaged file
+        if isinstance(error, ValueError) and str(error).startswith(call):
+            raise
+        raise unreadable(file, error) from error
+    if words:
+        warnings.warn(f"{call}: left out: {'; '.join(words)}", UserWarning, stacklevel=3)
+    return scene
+
+
+def _read(
+    file: Path, call: str, floating: bool | None, repair: bool, selection: ShapeSelection
+) -> tuple[Scene, list[str]]:
+    """Return the scene of a file, and in words what it leaves out; arguments and errors as :func:`read_usd`."""
     from pxr import Usd, UsdGeom, UsdPhysics  # an ImportError names the extra
 
-    builder, call = newton.ModelBuilder(), f"load: {str(file)!r}"
     check_nesting(file)
-    try:
-        stage = Usd.Stage.Open(str(file))
-        stage.Reload()  # layers stay in memory as long as a stage has them
-    except Exception as error:
-        raise unreadable(file, error) from error
+    stage = Usd.Stage.Open(str(file))
+    stage.Reload()  # layers stay in memory as long as a stage has them
     metre, kilogram = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
-    if not (0.0 < metre < math.inf and 0.0 < kilogram < math.inf):
-        raise ValueError(f"{call}: metersPerUnit is {metre}, kilogramsPerUnit {kilogram}; expected finite ones above 0")
-    check_numbers(call, stage)
+    for name, unit in (("metersPerUnit", metre), ("kilogramsPerUnit", kilogram)):
+        if not UNITS[0] <= unit <= UNITS[1]:
+            raise ValueError(f"{call}: {name} is {unit}; expected a number between {UNITS[0]:g} and {UNITS[1]:g}")
+    check_values(call, stage)
     prepare(call, stage)
-    try:
-        builder.default_shape_cfg.density *= metre**3 / kilogram  # the importer computes in the stage's units
-        builder.default_shape_cfg.mu = Contact.friction  # of shapes without a material
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "USD stages with non-unit", newton.NewtonWarning)  # converted below
-            found = builder.add_usd(
-                stage,
-                floating=floating,
-                load_visual_shapes=False,
-                skip_mesh_approximation=True,
-                schema_resolvers=[SchemaResolverNewton(), VendorAttributes()],
-            )
-    except ImportError:
-        raise
-    except Exception as error:
-        raise unreadable(file, error) from error
+    builder, found = _imported(stage, floating, metre**3 / kilogram)
     if builder.body_count == 0:
         raise ValueError(f"{call} has no rigid bodies; expected prims with PhysicsRigidBodyAPI")
     joints = ImportedJoints(call, stage, builder, found["path_joint_map"])
@@ -96,16 +99,40 @@ def read_usd(file: Path, floating: bool | None, repair: bool, selection: ShapeSe
     scene = scene_of(file, builder, repair, selection)
     scene = with_scaled_drives(call, scene, accelerated)
     scene = with_weightless_bodies(scene, weights_held_up(stage))
-    words = []
-    stage.GetSessionLayer().Clear()  # the file's own words count from here
+    stage.GetSessionLayer().Clear()  # from here on the stage says what the file says
     loops, labels = {loop.label for loop in scene.loops}, builder.joint_label
     of_loops = {path for path, joint in found["path_joint_map"].items() if labels[joint] in loops}
-    words += left_out(
-        stage, of_loops, set(found["path_joint_map"]), found["physics_scene_path"], selection.contacts is not None
-    )
-    if words:
-        warnings.warn(f"{call}: left out: {'; '.join(words)}", UserWarning, stacklevel=3)
-    return scene
+    contacts = selection.contacts is not None
+    return scene, left_out(stage, of_loops, set(found["path_joint_map"]), found["physics_scene_path"], contacts)
+
+
+def _imported(stage: Any, floating: bool | None, density: float) -> tuple[newton.ModelBuilder, dict[str, Any]]:
+    """Return what Newton's importer makes of a stage, and what it says of it.
+
+    Args:
+        stage: as :func:`prepare` leaves it. floating: as of ``load``. density: by which kilograms per cubic metre are
+            to be multiplied in the stage's units, in which the importer computes.
+    """
+    orders = ["dfs", "bfs"]  # the first calls itself at each joint of a chain, the second does not
+    while True:
+        builder = newton.ModelBuilder()
+        builder.default_shape_cfg.density *= density
+        builder.default_shape_cfg.mu = Contact.friction  # of shapes without a material
+        order: Any = orders.pop(0)
+        try:
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "USD stages with non-unit", newton.NewtonWarning)  # converted later
+                return builder, builder.add_usd(
+                    stage,
+                    floating=floating,
+                    load_visual_shapes=False,
+                    skip_mesh_approximation=True,
+                    schema_resolvers=[SchemaResolverNewton(), VendorAttributes()],
+                    joint_ordering=order,
+                )
+        except RecursionError:
+            if not orders:
+                raise
 
 
 def _refuse_lost_bodies(call: str, stage: Any, builder: newton.ModelBuilder) -> None:
@@ -213,7 +240,11 @@ def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool, selection: 
 
 
 def unreadable(file: Path, error: Exception) -> ValueError:
-    """Return the error for a file on which an importer failed; importers raise errors of any type for a damaged one."""
+    """Return the error for a file on which an importer failed; its own words become one line."""
+    try:
+        words = shown(" ".join(str(error).split()), MOST)
+    except UnicodeDecodeError:  # the words of OpenUSD may hold the file's bytes
+        words = "bytes that are no text"
     return ValueError(
-        f"load: {str(file)!r}: Newton's importer cannot read it ({type(error).__name__}: {error}); correct the file"
+        f"load: {str(file)!r}: Newton's importer cannot read it ({type(error).__name__}: {words}); correct the file"
     )

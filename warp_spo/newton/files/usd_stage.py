@@ -100,29 +100,41 @@ def applied_schemas(prim: Any) -> list[str]:
     return [str(name) for name in prim.GetPrimTypeInfo().GetAppliedAPISchemas()]
 
 
-def check_numbers(call: str, stage: Any) -> None:
-    """Raise ValueError for an attribute of physics or a pose of a stage that is not finite; ``call`` is for errors."""
+def check_values(call: str, stage: Any) -> None:
+    """Raise ValueError for a value of physics or a pose of a stage that no file can mean; ``call`` is for errors."""
     from pxr import UsdGeom, UsdPhysics
 
     cache = UsdGeom.XformCache()
     for prim in all_prims(stage):
         for attribute in prim.GetAuthoredAttributes():
-            if is_physical(attribute.GetName()):
-                value = attribute.Get()
-                try:
-                    numbers = np.array(0.0 if value is None else value, dtype=np.float64)
-                except (TypeError, ValueError):
-                    continue  # no number
-                infinite = np.isinf(numbers).any() and not matches(attribute.GetName(), INFINITE)
-                if infinite or np.isnan(numbers).any():
-                    name = shown(str(attribute.GetPath()))
-                    raise ValueError(f"{call}: {name} is {value}; expected finite numbers; correct the file")
+            name = attribute.GetName()
+            value = attribute.Get() if is_physical(name) else None
+            if value is not None and (expected := _expectation(name, value)):
+                path = shown(str(attribute.GetPath()))
+                raise ValueError(f"{call}: {path} is {shown(str(value))}; expected {expected}; correct the file")
         if prim.HasAPI(UsdPhysics.RigidBodyAPI) or prim.HasAPI(UsdPhysics.CollisionAPI):
             if not np.isfinite(np.array(cache.GetLocalToWorldTransform(prim))).all():
                 name = shown(str(prim.GetPath()))
                 raise ValueError(
                     f"{call}: the pose of {name} is not finite; expected finite xformOps; correct the file"
                 )
+
+
+def _expectation(name: str, value: Any) -> str:
+    """Return in words what a value should be that it is not, "" if all is well."""
+    if name == "physics:axis":
+        return "" if value in HALF_TURNS else "X, Y or Z"
+    if name.startswith("physics:localRot"):
+        size = math.hypot(value.real, *value.imaginary)
+        return "" if 1e-3 < size < 1e3 else "a unit quaternion"
+    try:
+        numbers = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return ""  # no number
+    if np.isnan(numbers).any() or (np.isinf(numbers).any() and not matches(name, INFINITE)):
+        return "finite numbers"
+    unreachable = {"physics:lowerLimit": math.inf, "physics:upperLimit": -math.inf}.get(name)
+    return "a bound that can be reached" if unreachable is not None and (numbers == unreachable).any() else ""
 
 
 def prepare(call: str, stage: Any) -> None:
@@ -141,6 +153,14 @@ def prepare(call: str, stage: Any) -> None:
     joints = [UsdPhysics.Joint(prim) for prim in all_prims(stage) if prim.IsA(UsdPhysics.Joint)]
     joints = [joint for joint in joints if joint.GetJointEnabledAttr().Get()]
     for joint in joints:
+        for relation in (joint.GetBody0Rel(), joint.GetBody1Rel()):
+            targets = relation.GetTargets()
+            if len(targets) > 1 or not all(stage.GetPrimAtPath(target) for target in targets):
+                places = ", ".join(shown(str(target)) for target in targets[:2])
+                raise ValueError(
+                    f"{call}: {shown(str(relation.GetPath()))} leads to {places}; expected one prim of the stage, or "
+                    "none for the world"
+                )
         for end in (_end(stage, joint.GetBody0Rel()), _end(stage, joint.GetBody1Rel())):
             if end and not stage.GetPrimAtPath(end).GetAttribute("physics:rigidBodyEnabled").Get():
                 raise UnsupportedError(
@@ -216,6 +236,8 @@ def reversed_joints(stage: Any, joints: list[Any]) -> list[Any]:
             continue
         above = _reached(start, neighbors)
         seen |= set(above)
+        if any(len({ends[joint] for joint in some}) > 1 for body in above for some in neighbors[body].values()):
+            continue  # two joints between the same bodies are one if they lead the same way, a loop otherwise
         roots = on_world & set(above)
         if sum(len(neighbors[body]) for body in above) != 2 * (len(above) - 1) or len(roots) > 1:
             continue  # no tree
