@@ -113,11 +113,15 @@ def sum_eigenvectors(
     right: wp.array2d[Any],
     world: int,
     noise: Any,
+    expected: int,
+    clear: Any,
     out: wp.array2d[Any],
 ):
     """out = -scale V A^+ V* scale right, for a diagonal A; return its rank, its smallest and its largest entry.
 
-    Entries up to ``noise`` times the largest count as zero; the smallest is that of the others.
+    Entries up to ``noise`` times the largest count as zero, and those up to ``clear`` times the largest where
+    ``expected`` others are larger: of rows that are redundant where the loops are closed, and are closed nearly. The
+    smallest is that of the others.
     """
     n = A.shape[1]
     largest = A.dtype(0.0)
@@ -128,7 +132,12 @@ def sum_eigenvectors(
         out[world, i] = A.dtype(0.0)
     for i in range(n):
         value = A[world, i, i]
-        if value > noise * largest:
+        larger = int(0)
+        for j in range(n):
+            if A[world, j, j] > value:
+                larger += 1
+        least = wp.where(expected >= 0 and larger >= expected, wp.max(noise, clear), noise)
+        if value > least * largest:
             rank += 1
             smallest = wp.min(smallest, value)
             along = A.dtype(0.0)
@@ -145,8 +154,10 @@ def solve_least_norm(T: type) -> wp.Kernel:
 
     The kernel scales rows by their ``size`` s and decomposes s^-1/2 A s^-1/2 = V E V*. Of all least-squares solutions
     of A x = -right, out is the one with the least sum of s x^2, which does not depend on the choice of units.
-    ``resolved`` is the ratio of the smallest nonzero eigenvalue to the largest. A rank below ``expected`` makes out NaN
-    and resolved 0. An equation that is not finite, because Mass has no inverse, makes out NaN and resolved 1: its rank
+    ``resolved`` is the ratio of the smallest nonzero eigenvalue to the largest. ``expected`` is the rank where the
+    loops usually close, or -1 where that is unknown. A rank below it makes out NaN and resolved 0. Eigenvalues beyond
+    it count where they are above the root of eps times the largest one. Where it is 0, all of A is rounding: out and
+    the rank are 0. An equation that is not finite, because Mass has no inverse, makes out NaN and resolved 1: its rank
     is not what is lost. Where all pivots of a Cholesky factorisation are far above rounding, the kernel uses that
     factorisation instead, which is many times faster.
     """
@@ -168,14 +179,18 @@ def solve_least_norm(T: type) -> wp.Kernel:
         n = A.shape[1]
         rank, resolved, smallest, largest = int(0), T(1.0), T(0.0), T(0.0)
         healthy, bound = equilibrate(A, right, size, world, scale_out, out)
-        if healthy and solve_positive(A, V_out, out, world, T(n) * wp.sqrt(eps) * bound) > T(1.0):
+        if healthy and expected == 0:
+            for i in range(n):
+                out[world, i] = T(0.0)
+        elif healthy and solve_positive(A, V_out, out, world, T(n) * wp.sqrt(eps) * bound) > T(1.0):
             for i in range(n):
                 out[world, i] = out[world, i] * scale_out[world, i]
             rank = n
         elif healthy:
             diagonalise(A, world, T(0.05) * eps * bound, V_out)
             noise = T(wp.static(NOISE)) * T(n) * eps
-            rank, smallest, largest = sum_eigenvectors(A, V_out, scale_out, right, world, noise, out)
+            clear = wp.sqrt(eps)
+            rank, smallest, largest = sum_eigenvectors(A, V_out, scale_out, right, world, noise, expected, clear, out)
             if largest > T(0.0):
                 resolved = smallest / largest
             if rank < expected:

@@ -84,7 +84,10 @@ _ADVICE = {
     ),
     Status.RANGE: "Change the units of mass or length, or use float64.",
     Status.NOT_SETTLED: "Use a shorter dt. The step stands, with a force that a shorter dt would correct.",
-    Status.LOOPS: "Use float64, or keep the mechanism away from configurations in which it can branch or lock.",
+    Status.LOOPS: (
+        "Use float64, or keep the mechanism away from configurations in which it can branch or lock. Cut the loops at "
+        "other joints where every state has this word."
+    ),
     Status.OPEN: (
         "Dynamics.project closes the state from which steps start. Otherwise use a shorter dt, or float64 where angles "
         "span many turns or places lie 100 m from the origin."

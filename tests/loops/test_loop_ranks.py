@@ -10,7 +10,7 @@ from support import laws, mechanisms, zoo
 from support.closed_loops import AGREE, DIFFERENCES, both, by_embedding, by_multipliers, flat, lagrange, traced
 from support.mechanisms import MECHANISMS, Closed
 from support.quick import slow_unless
-from warp_spo.dynamics.loop_analysis import ClosureEvaluator, _spanning, drawn, embedding
+from warp_spo.dynamics.loop_analysis import ClosureEvaluator, _generic_ranks, _spanning, drawn, embedding
 from warp_spo.examples.parts import at, bar
 from warp_spo.recursions.loops.embedded import Embedding
 from warp_spo.reference.dense import homogeneous, pose7
@@ -122,7 +122,8 @@ def test_near_parallel_loops(apart, dtype):
         for x in (0.3, 0.3 + apart)
     ]
     scene = spo.Scene(scene.bodies, scene.hinges, loops=loops)
-    how = Embedding(tuple(_spanning(ClosureEvaluator(scene).at(q)[1])[0]), ())  # five of six
+    closing = ClosureEvaluator(scene)
+    how = Embedding(tuple(_spanning(closing.at(q)[1], _generic_ranks(closing, q)[0])[0]), ())  # five of six
     s = mechanisms.States(q, *np.random.default_rng(0).normal(size=(3, 1, scene.dof_count)), np.zeros((1, 4, 6)))
     shapes = {"out": (scene.dof_count,), "margin": (len(how.rows),)}
     right = traced(scene, "embedded_forward_dynamics", s._asdict(), ("q", "tau"), shapes, embedding=how, status=True)

@@ -1,7 +1,8 @@
 """Scenes, truths to compare with, and checks that several test files share. No test file imports another one.
 
 Scenes:
-    ``zoo`` (trees of every kind of hinge), ``robots``, ``mechanisms`` (closed loops), ``granularity_scenes`` and
+    ``zoo`` (trees of every kind of hinge), ``robots``, ``mechanisms`` and ``redundant_loops`` (closed loops),
+    ``granularity_scenes`` and
     ``segments_of_trees`` (limbs side by side), ``value_scenes``, ``operator_scenes`` (weighted graphs, no robots),
     ``operators_of_robots``, ``border`` (one scene, arrays of all kinds), ``env_scenes``.
 Joints and what drives them:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import UnsupportedError, as_integer, shown
-from ..recursions.loops.closures import closures
+from ..recursions.loops.closures import closures, one_world
 from ..recursions.loops.clusters import clusters
 from ..recursions.loops.embedded import Embedding
 from ..recursions.loops.projection import closure_error, closure_jacobian, move
@@ -26,6 +26,7 @@ SAMPLES = 64
 STEPS = 60
 CLOSED = 1e-9  # largest g of a configuration that counts as closed [m, rad]
 RANK = 1e-7  # singular values below this share of the largest are zero: the rows are redundant
+MARGIN = 100.0  # by which the square of a singular value that counts is above the error that the closures are left with
 WORST = 0.1  # share of the draws that a choice may serve worse than it is said to
 NEARLY = 0.3  # share of the best choice's hold that an earlier dof must have
 NAMED = 6  # bodies that an error lists
@@ -41,13 +42,13 @@ class ClosureEvaluator:
     """
 
     def __init__(self, scene: Scene):
-        one = {name: array[0] for name, array in scene.values.items() if array.shape[0] > 1}
-        self.scene = scene.with_values(**one) if one else scene
+        self.scene = one_world(scene)
         trace = Trace(Links(self.scene), "float64", ("q", "step"))
         constraints = closures(trace.links)
         self.clusters = clusters(trace.links, constraints)
         self.size = sum(constraint.rows for constraint in constraints)
         self._error, self._jacobian = closure_error(trace), closure_jacobian(trace)
+        self._sizes = [size for constraint in constraints for size in constraint.sizes(trace.places)]
         step = trace.vector("step")
         self._moved = [
             (link.coordinate + i, value)
@@ -64,6 +65,12 @@ class ClosureEvaluator:
             into: Any = g if len(item.index) == 1 else Y
             into[(slice(None), *item.index)] = value
         return g, Y
+
+    def sizes(self, q: np.ndarray) -> np.ndarray:
+        """Return the size of each row [sample, row]: the root of the sum of squares that the row is a projection of."""
+        values = evaluate(self._sizes, lambda _, index: q[:, index[0]])
+        sizes = np.stack(np.broadcast_arrays(np.zeros(len(q)), *values), axis=1)[:, 1:]
+        return np.sqrt(np.maximum(sizes, np.finfo(float).tiny))
 
     def moved(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
         """Return q [sample, coordinate] after a small step of the dofs [sample, dof]."""
@@ -124,17 +131,38 @@ def drawn(scene: Scene, count: int, seed: int = 0) -> np.ndarray:
 def usual_rank(scene: Scene) -> int:
     """Return how many rows are independent where the loops close, other than at change points.
 
-    The result is 0 if no closed configuration was found.
+    The result is -1 if no closed configuration was found.
     """
     closing = ClosureEvaluator(scene)
     q = closing.closed(drawn(scene, SAMPLES))
-    if len(q) == 0 or closing.size == 0:
-        return 0
-    Y, rank = closing.at(q)[1], 0
+    if len(q) == 0:
+        return -1
+    return sum(int(ranks.max()) for ranks in _generic_ranks(closing, q))
+
+
+def _generic_ranks(closing: ClosureEvaluator, q: np.ndarray) -> list[np.ndarray]:
+    """Return, for each cluster, the number of independent rows at each sample [sample]; -1 where it is undecided.
+
+    Rows are scaled by their sizes, so that units do not matter. Where the closures are left with an error g, a singular
+    value s that is zero at the closed configuration nearby reads up to |g| / t, t the smallest that is not: near a
+    change point t is small, and rows that are redundant for good seem to count. Those with s^2 > MARGIN |g| count: by
+    Kantorovich's theorem a closed configuration is nearby in which they are independent. A sample decides where all
+    others are within MARGIN |g| / t. If none does, as for a mechanism whose only configuration is a change point, all
+    do, and RANK divides them.
+    """
+    (g, Y), sizes, found = closing.at(q), closing.sizes(q), []
     for cluster in closing.clusters:
-        singular = np.linalg.svd(Y[:, cluster.rows][:, :, cluster.dofs], compute_uv=False)
-        rank += int((singular > RANK * singular[:, :1]).sum(axis=1).max())
-    return rank
+        rows = cluster.rows
+        scaled = Y[:, rows][:, :, cluster.dofs] / sizes[:, rows, None]
+        error = np.abs(g[:, rows] / sizes[:, rows]).max(axis=1, initial=0.0) + np.finfo(float).eps
+        singular = np.linalg.svd(scaled, compute_uv=False)
+        counts = singular > np.sqrt(MARGIN * error)[:, None]
+        smallest = np.where(counts, singular, 1.0).min(axis=1, initial=1.0)
+        left = np.where(counts, 0.0, singular).max(axis=1, initial=0.0)
+        decided = left * smallest <= MARGIN * error
+        ranks = np.where(decided, counts.sum(axis=1), -1)
+        found.append(ranks if decided.any() else (singular > RANK * singular[:, :1]).sum(axis=1))
+    return found
 
 
 def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str = "Dynamics") -> Embedding:
@@ -165,9 +193,9 @@ def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str 
     Y = closing.at(q)[1]
     rows: list[int] = []
     free = set(range(scene.dof_count))
-    for cluster in clusters:
+    for cluster, ranks in zip(clusters, _generic_ranks(closing, q), strict=True):
         numbers, dofs = np.array(cluster.rows, dtype=int), np.array(cluster.dofs, dtype=int)
-        kept, X = _spanning(Y[:, numbers][:, :, dofs])
+        kept, X = _spanning(Y[:, numbers][:, :, dofs], ranks)
         rows += numbers[kept].tolist()
         if wanted is None:
             independent = _independent(X)
@@ -203,15 +231,17 @@ def _numbers(scene: Scene, asked: Sequence[int | str], call: str) -> set[int]:
     return found
 
 
-def _spanning(Y: np.ndarray) -> tuple[list[int], np.ndarray]:
-    """Rows that span all of them, of Y [draw, row, column], and orthonormal X [draw, column, free] with Y X = 0."""
-    singular = np.linalg.svd(Y, compute_uv=False)
-    ranks = (singular > RANK * singular[:, :1]).sum(axis=1)
+def _spanning(Y: np.ndarray, ranks: np.ndarray) -> tuple[list[int], np.ndarray]:
+    """Rows that span all of them, of Y [draw, row, column] of ``ranks`` [draw], where those are largest.
+
+    Return with them orthonormal X [draw, column, free] with Y X = 0.
+    """
     rank = int(ranks.max(initial=0))
     if rank == 0:
         return [], np.tile(np.eye(Y.shape[2]), (len(Y), 1, 1))
     Y = Y[ranks == rank]
-    measure = lambda rows: np.quantile(np.linalg.svd(Y[:, rows], compute_uv=False)[:, -1], WORST)  # noqa: E731
+    best = np.linalg.svd(Y, compute_uv=False)[:, rank - 1]
+    measure = lambda rows: np.quantile(np.linalg.svd(Y[:, rows], compute_uv=False)[:, -1] / best, WORST)  # noqa: E731
     rows = list(max(sorted({tuple(_pivots(y, rank)) for y in Y}), key=lambda rows: float(measure(list(rows)))))
     return rows, np.linalg.svd(Y[:, rows])[2][:, rank:].transpose(0, 2, 1)
 

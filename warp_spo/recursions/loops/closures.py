@@ -16,15 +16,22 @@ import numpy as np
 
 from ...errors import UnsupportedError
 from ...scene.parts import Coupling, Loop, in_plane
+from ...scene.scene import Scene
+from ...trace.evaluation import evaluate
 from ...trace.scalars import Value, less, reciprocal
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, dot, total
 from .. import articulated
-from ..model.links import BodyPlacement, Link, LinkPlacement, Links
+from ..model.links import BodyPlacement, Link, LinkPlacement, Links, place_link
+from ..model.scene_cache import cached_by_scene
 from ..motion import hinge_motion, own_bias
 
 PARALLEL = 1e-6  # sine of the angle between two axes of a loop joint, below which they are one
 OPEN = 1e-5  # [rad], or distance over arm; a larger error is an open closure. Float32 rounds a few turns by less
+VANISHES = 1e-20  # share of the squares of the distances that cancel in a size; a smaller size is rounding
 SLOW = 1e-4  # [rad/s, m/s]; slower rates are not judged: the rates of a rigid truss are rounding alone
+
+
+FixedSizes = tuple[float | None, float | None]
 
 
 class LinkState(NamedTuple):
@@ -85,13 +92,16 @@ class Closure:
     Args:
         links: of the scene.
         loop: the joint.
+        fixed_sizes: sizes of rows that slide and of rows that turn, where those of the motion are rounding; see
+            :meth:`sizes`.
 
     Raises:
         UnsupportedError: a joint whose directions depend on how often it was turned round (helical), or whose axes are
             parallel.
     """
 
-    def __init__(self, links: Links, loop: Loop):
+    def __init__(self, links: Links, loop: Loop, fixed_sizes: FixedSizes = (None, None)):
+        self.fixed_sizes = fixed_sizes
         self.inner, self.outer = (
             links.placement(loop.parent, loop.parent_pose),
             links.placement(loop.child, loop.child_pose),
@@ -129,28 +139,44 @@ class Closure:
         inner, outer = self._anchors(places)
         found: list[dict[int, Value]] = [{} for _ in range(self.rows)]
         rows = self._rows(inner, outer)
-        for dof, w, v in self._columns(places, outer):
+        for dof, w, v, _ in self._columns(places, outer):
             for entries, row in zip(found, rows, strict=True):
                 value = dot(row.w, w) + dot(row.v, v)
                 entries[dof] = entries[dof] + value if dof in entries else value
         return found
 
     def sizes(self, places: dict[int, LinkPlacement]) -> list[Value]:
-        """Return, for each row of Y, the sum of squares of the twists that it is a projection of."""
-        _, outer = self._anchors(places)
-        turning, sliding = 0.0, 0.0
-        for _, w, v in self._columns(places, outer):
-            turning, sliding = turning + dot(w, w), sliding + dot(v, v)
+        """Return, for each row of Y, the sum of squares of the twists that it is a projection of.
+
+        Where no motion moves the joint in any configuration, as that of a door's second hinge, the sum is rounding.
+        The square of the distances that cancel in it takes its place, and 1 where rotations do.
+        """
+        sliding, turning, _ = self.sums_of_squares(places)
+        sliding, turning = (
+            found if fixed is None else fixed for found, fixed in zip((sliding, turning), self.fixed_sizes, strict=True)
+        )
         return [sliding] * len(self.slides) + [turning] * (self.rows - len(self.slides))
 
-    def _columns(self, places: dict[int, LinkPlacement], outer: LinkState) -> Iterator[tuple[int, Vector, Vector]]:
-        """Yield (dof, w, v): the relative twist at the child anchor per unit rate of each dof."""
+    def sums_of_squares(self, places: dict[int, LinkPlacement]) -> tuple[Value, Value, Value]:
+        """Return those of velocities and of angular velocities, over unit rates of all dofs, and of distances."""
+        inner, outer = self._anchors(places)
+        turning, sliding = 0.0, 0.0
+        distances = dot(inner.origin, inner.origin) + dot(outer.origin, outer.origin)
+        for _, w, v, arm in self._columns(places, outer):
+            turning, sliding = turning + dot(w, w), sliding + dot(v, v)
+            distances = distances + dot(arm, arm)
+        return sliding, turning, distances
+
+    def _columns(
+        self, places: dict[int, LinkPlacement], outer: LinkState
+    ) -> Iterator[tuple[int, Vector, Vector, Vector]]:
+        """Yield (dof, w, v, arm): the relative twist at the child anchor per unit rate of each dof, and its arm."""
         for path, sign in ((self.inner_path, -1.0), (self.outer_path, 1.0)):
             for link, state in zip(path, self._states(path, places), strict=True):
                 arm = outer.origin - state.origin
                 for dof, H in zip(link.dofs, articulated.columns(link, places[id(link)]), strict=True):
                     w, v = state.axes @ Vector(H[:3]), state.axes @ Vector(H[3:])
-                    yield dof, w * sign, (v + cross(w, arm)) * sign
+                    yield dof, w * sign, (v + cross(w, arm)) * sign, arm
 
     def acceleration(self, places: dict[int, LinkPlacement], qd: Any, qdd: Callable[[int], Value]) -> list[Value]:
         """Return Y qdd + Y' qd; ``qd`` None is zero."""
@@ -275,11 +301,36 @@ def closures(links: Links) -> list[Closure | CouplingConstraint]:
     """Return the constraints of a scene: of its loop joints, then of its couplings."""
     scene = links.scene
     by_dof = {dof: link for link in links.leaders for dof in link.dofs}
-    found: list[Closure | CouplingConstraint] = [Closure(links, loop) for loop in scene.loops]
+    found: list[Closure | CouplingConstraint] = [
+        Closure(links, loop, fixed) for loop, fixed in zip(scene.loops, _fixed_sizes(scene), strict=True)
+    ]
     for coupling in scene.couplings:
         follower, leader = (by_dof[int(scene.qd_start[h])] for h in (coupling.hinge, coupling.reference))
         found.append(_coupling_constraint(follower, leader, coupling))
     return found
+
+
+@cached_by_scene
+def _fixed_sizes(scene: Scene) -> list[FixedSizes]:
+    """Return the fixed sizes of each loop joint; a size is rounding if it is in several configurations."""
+    links, rng = Links(one_world(scene)), np.random.default_rng(0)
+    joints, sums = [Closure(links, loop) for loop in scene.loops], []
+    for _ in range(3):
+        q = (scene.neutral_q + rng.uniform(-1.0, 1.0, len(scene.neutral_q))).tolist()
+        places = {id(link): place_link(link, q.__getitem__) for link in links.links}
+        values = [value for joint in joints for value in joint.sums_of_squares(places)]
+        sums.append(np.array(evaluate(values, lambda *_: 0.0), dtype=float).reshape(-1, 3))
+    sliding, turning, distances = np.max(sums, axis=0).T if joints else np.zeros((3, 0))
+    return [
+        (float(far) if slide <= VANISHES * far else None, 1.0 if turn <= VANISHES else None)
+        for slide, turn, far in zip(sliding, turning, distances, strict=True)
+    ]
+
+
+def one_world(scene: Scene) -> Scene:
+    """Return a scene with the values of world 0 in all worlds."""
+    one = {name: array[0] for name, array in scene.values.items() if array.shape[0] > 1}
+    return scene.with_values(**one) if one else scene
 
 
 def count_open_rows(
