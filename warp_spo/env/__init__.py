@@ -66,20 +66,27 @@ __all__ = [
 ]
 
 
-def gymnasium(env: Env, tensors: bool = False, single: bool = False) -> Any:
-    """Return an environment as a ``gymnasium.vector.VectorEnv``, whose worlds start anew in the step that ends them.
+def gymnasium(env: Env, tensors: bool = False, single: bool = False, autoreset_mode: Any = "SameStep") -> Any:
+    """Return an environment as a ``gymnasium.vector.VectorEnv``.
 
     Observations are NumPy arrays [world, number], or a dictionary of them if there are several groups. Actions are
     unbounded; their space says -1 to 1, from which random ones are drawn.
 
     Args:
-        env: the environment. With ``final_observations=True`` the information holds "final_obs".
-        tensors: whether observations, rewards and ends are torch tensors on the environment's device.
+        env: the environment. With ``final_observations=True`` the information holds "final_obs" in the mode "SameStep";
+            other modes need it.
+        tensors: whether observations, rewards, ends and information are torch tensors on the environment's device.
         single: return a ``gymnasium.Env`` of the one world of ``env`` instead, which waits for ``reset``.
+        autoreset_mode: a ``gymnasium.vector.AutoresetMode`` or its value. "SameStep": a world starts anew in the step
+            that ends its episode. "NextStep": in the step after it, which ignores its action and has reward 0.
+            "Disabled": in ``reset(options={"reset_mask": ...})``, before the next step. Episodes are the same in all.
+
+    Raises:
+        ValueError: the mode is none, or needs ``final_observations=True``; single=True with several worlds.
     """
     from .interfaces import make_single, make_vector
 
-    return make_single(env) if single else make_vector(env, tensors)
+    return make_single(env) if single else make_vector(env, tensors, autoreset_mode)
 
 
 def skrl(env: Env, observations: str | None = None, states: str | None = None) -> Any:

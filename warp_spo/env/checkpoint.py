@@ -99,6 +99,26 @@ def load_state_dict(self: Env, state: Mapping[str, torch.Tensor]) -> None:
     self._set_values()
 
 
+def copy_worlds(env: Env, worlds: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Return copies of all that belongs to some worlds, whole numbers, by name; :func:`restore_worlds` takes them."""
+    return {name: tensor.index_select(axis, worlds) for name, (tensor, axis) in _by_world(env).items()}
+
+
+def restore_worlds(env: Env, worlds: torch.Tensor, copies: Mapping[str, torch.Tensor]) -> None:
+    """Make worlds what they were when :func:`copy_worlds` copied them; a :class:`TorchTerm` has to remember itself."""
+    for name, (tensor, axis) in _by_world(env).items():
+        tensor.index_copy_(axis, worlds, copies[name])
+    if env._values_later:
+        env._set_values()
+
+
+def _by_world(env: Env) -> dict[str, tuple[torch.Tensor, int]]:
+    """Return the tensors of :func:`copy_worlds` and their axes of worlds."""
+    delays = {f"actuator state {i}": (part, 0) for i, part in enumerate(env._actuator_state or ())}
+    seen = {f"seen {name}": (env._store.part(env._store.out, name), 0) for name in env.num_obs}
+    return env._store.worlds_of() | delays | seen
+
+
 def _check_tensors(what: str, given: Any) -> None:
     """Raise TypeError unless something is a dictionary of tensors."""
     if not isinstance(given, Mapping) or not all(isinstance(each, torch.Tensor) for each in given.values()):

@@ -18,7 +18,7 @@ from ..runtime.arrays import parse_device
 from ..runtime.launches import compile_side_by_side
 from ..runtime.torch_tensors import stream
 from ..scene.scene import Scene
-from . import arguments, checkpoint
+from . import arguments, checkpoint, seeding
 from .compile.buffers import Storage
 from .compile.cuda_graphs import Part, Replay, run_all
 from .compile.fused_kernel import Launch
@@ -117,7 +117,6 @@ class Env(VecEnv):
         self.log_interval = check_whole("Env", "log_interval", log_interval, 1)
         self._passes, self.has_commands = arguments.checked_passes(scene, passes), commands is not None
         self.final = arguments.checked_bool("final_observations", final_observations)
-        self._steps = 0
         default = arguments.checked_default(scene, default_q)
         terms = arguments.checked_terms(observations, rewards, terminations or {}, events)
         self._layout = MemoryLayout(scene, default, self.step_dt, commands, changed_values(scene, events))
@@ -130,15 +129,12 @@ class Env(VecEnv):
         self._step_options = StepOptions(substeps=self.decimation, passes=self._passes)
         self.values, self._actuator_state = store.values, self._delay_buffers(events)
         self._log = Log(self._layout, self.reward_names, self.termination_names, self.device, worlds)
-        self.set_seed(self.seed)
         self._kernels = self._build(tracing)
         wanted = self.warp_device.is_cuda if graph is None else bool(graph) and self.warp_device.is_cuda
         self.replay = Replay(self._parts(), wanted)
         if self.warp_device.is_cuda:
             self._compile()
-        self._launch("start")
-        self._set_values()
-        self.reset()
+        self.reset(seed=seed)
 
     def _trace(self, actions: Any, groups: Any, rewards: Any, terminations: Any, commands: Any, events: Any) -> Tracing:
         """Return the traced stages of the checked terms; keep the names and counts of their numbers."""
@@ -173,12 +169,7 @@ class Env(VecEnv):
         return self.dyn.actuator_state(like=self.q, longest=max(delays))
 
     # -- numbers that may be written --------------------------------------------------------------------------------
-    def set_seed(self, seed: int) -> None:
-        """Set the seed of all later random numbers, 64 bits; the steps of the worlds count from zero again."""
-        self.seed = check_whole("Env.set_seed", "seed", seed, 0, 2**64 - 1)
-        words = [self.seed & 0xFFFFFFFF, self.seed >> 32 & 0xFFFFFFFF, self.first_world]
-        self._tensors["key"].copy_(torch.tensor(np.array(words, dtype=np.uint32).view(np.int32)))
-        self._tensors["tick"].zero_()
+    set_seed = seeding.set_seed
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
@@ -220,8 +211,21 @@ class Env(VecEnv):
         """Return the observations of the present state, a TensorDict of [world, number] by group."""
         return self._observations(self._store.out.clone())
 
-    def reset(self, mask: torch.Tensor | None = None) -> tuple[Any, dict]:
-        """Start worlds anew: those where ``mask`` [world] is True, or all; return observations and an empty dict."""
+    def reset(self, mask: torch.Tensor | None = None, seed: int | Sequence[int] | None = None) -> tuple[Any, dict]:
+        """Start worlds anew, and return observations and an empty dictionary.
+
+        Args:
+            mask: bool [world], the worlds; None: all.
+            seed: None: random numbers go on. A seed as in :meth:`set_seed` makes of this a new environment of that
+                seed, to the bit: what is drawn at the "start" is drawn anew, and levels and logs begin again.
+
+        Raises:
+            ValueError: the mask or a seed is none, or both are given: a seed is for all worlds.
+        """
+        if seed is not None:
+            if mask is not None:
+                raise ValueError("Env.reset: got mask and seed; expected one of them: a seed starts all worlds anew")
+            seeding.begin(self, seed)
         if mask is None:
             self.chosen.fill_(True)
         else:
@@ -341,9 +345,6 @@ class Env(VecEnv):
             self._physics()
             self._after_reset()
         torch.cuda.synchronize(self.device)
-        self._tensors["memory"].zero_()
-        self._tensors["episode_length"].zero_()
-        self.set_seed(self.seed)
 
     def _parts(self) -> list[Part]:
         """Return the parts of a step."""

@@ -38,6 +38,10 @@ class Log:
         )
         self._cut = torch.zeros(worlds, device=device)  # number of a world's episode whose age was written; 0: none
 
+    def clear(self) -> None:
+        """Forget whose ages were written."""
+        self._cut.zero_()
+
     def write_ages(self, memory: torch.Tensor, written: torch.Tensor) -> None:
         """Leave the lengths of the episodes that now go on where ``written`` [world] holds out of the report."""
         self._cut = torch.where(written, memory[self._episodes][0] + 1.0, self._cut)

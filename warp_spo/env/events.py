@@ -56,8 +56,8 @@ class Values:
         names: of the values that it changes, of those that ``Dynamics`` takes as ``variable``.
         change: function of a ``World`` that assigns to entries of ``w.values[name]``, which are the scene's own
             numbers before; arrays [...] in Newton's layout.
-        when: "start": once, when the environment is made. "reset": at each start of an episode. Or the range of the
-            time from one change to the next [s].
+        when: "start": once, when the environment is made, and in ``env.reset(seed=)``. "reset": at each start of an
+            episode. Or the range of the time from one change to the next [s].
     """
 
     names: tuple[str, ...]

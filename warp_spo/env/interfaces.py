@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from . import arguments, checkpoint
 from .environment import Env
 
 
@@ -26,46 +27,122 @@ def _plain(env: Env, observed: Any, tensors: bool) -> Any:
     return groups if len(groups) > 1 else next(iter(groups.values()))
 
 
-def make_vector(env: Env, tensors: bool = False) -> Any:
+def make_vector(env: Env, tensors: bool = False, autoreset_mode: Any = "SameStep") -> Any:
     """Return a ``gymnasium.vector.VectorEnv``; see :func:`warp_spo.env.gymnasium`."""
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 
-    class VectorWorlds(VectorEnv):
-        """All worlds of an ``Env``; a world whose episode ends starts anew in the same step."""
+    try:
+        mode = AutoresetMode(autoreset_mode)
+    except ValueError:
+        names = ", ".join(repr(each.value) for each in AutoresetMode)
+        raise ValueError(f"env.gymnasium: autoreset_mode is {autoreset_mode!r}; expected one of {names}") from None
+    if mode is not AutoresetMode.SAME_STEP and not env.final:
+        raise ValueError(
+            f"env.gymnasium: autoreset_mode={mode.value!r} with final_observations=False; the step that ends an "
+            "episode returns its last observation: expected Env(..., final_observations=True)"
+        )
 
-        metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
+    nobody = torch.zeros(0, dtype=torch.int64)
+
+    class VectorWorlds(VectorEnv):
+        """All worlds of an ``Env``, whose episodes are the same to the bit in all autoreset modes.
+
+        The ``Env`` starts a world anew in the step that ends its episode. In other modes than SAME_STEP its last
+        observation is shown until Gymnasium's time of the reset: a world that waits is set back to its start after
+        steps of the others.
+        """
+
+        metadata = {"autoreset_mode": mode, "render_modes": []}  # noqa: RUF012
 
         def __init__(self) -> None:
             self.env, self.num_envs = env, env.num_envs
             self.single_observation_space, self.single_action_space = _spaces(env)
             self.observation_space = batch_space(self.single_observation_space, env.num_envs)
             self.action_space = batch_space(self.single_action_space, env.num_envs)
+            self._waiting = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)  # none in SAME_STEP
+            self._last: Any = None  # observations of the step before, of which those of worlds that wait are shown
 
-        def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
-            """Start all worlds anew, or those of ``options["reset_mask"]``, with a new seed if one is given."""
-            super().reset(seed=seed)
+        def reset(self, *, seed: Any = None, options: dict | None = None) -> tuple[Any, dict]:
+            """Start all worlds anew, or those of ``options["reset_mask"]``; a seed makes a new environment of all.
+
+            Args:
+                seed: None, or a seed as ``Env.reset`` takes it: of all worlds, or a list with one of each.
+                options: None, or a dictionary, of which "reset_mask", bool [world], is read.
+            """
             mask = None if options is None else options.get("reset_mask")
-            if seed is not None:
-                env.set_seed(seed)
-            observed, info = env.reset(None if mask is None else torch.as_tensor(mask))
-            return _plain(env, observed, tensors), info
+            if seed is not None or mask is None:
+                env.reset(mask, seed)
+                self._waiting.zero_()
+            else:
+                mask = arguments.checked_mask("reset: options['reset_mask']", mask, env.num_envs, env.device)
+                env.reset(mask & ~self._waiting)  # those that wait have started anew
+                self._waiting &= ~mask
+            if not isinstance(seed, list | tuple | np.ndarray):
+                super().reset(seed=None if seed is None else int(seed))
+            return _plain(env, self._shown(env.get_observations()), tensors), {}
 
         def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict]:
-            """Take a step; in the information, "log" and, where the environment has them, "final_obs"."""
+            """Take a step; "log" and, in the mode SAME_STEP, "final_obs" are in the information, [world]."""
             given = torch.as_tensor(np.asarray(actions, dtype=np.float32) if not tensors else actions)
+            waiting = self._waiting.nonzero()[:, 0] if mode is not AutoresetMode.SAME_STEP else nobody
+            if len(waiting) and mode is AutoresetMode.DISABLED:
+                raise RuntimeError(
+                    f"step: autoreset_mode is 'Disabled' and episodes of worlds {waiting.tolist()} have ended; "
+                    "expected reset(options={'reset_mask': terminated | truncated}) before the next step"
+                )
+            copies = checkpoint.copy_worlds(env, waiting) if len(waiting) else {}
             observed, rewards, done, extras = env.step(given.to(env.device))
-            late = extras["time_outs"].bool()
-            ended = done.bool() & ~late
-            info: dict[str, Any] = {key: value for key, value in extras.items() if key == "log"}
-            if "final_observations" in extras:
-                info["final_obs"] = _plain(env, extras["final_observations"], tensors)
-                info["_final_obs"] = done.bool() if tensors else done.bool().cpu().numpy()
-            parts = (rewards, ended, late)
+            ends, late = done.bool(), extras["time_outs"].bool()
+            log = extras.get("log", {})
+            if len(waiting):
+                checkpoint.restore_worlds(env, waiting, copies)
+                observed, log = env.get_observations(), env.log() if log else {}
+                ends[waiting], late[waiting], rewards[waiting] = False, False, 0.0
+            info = {"log": _by_world(log, env.num_envs, tensors)} if log else {}
+            if mode is not AutoresetMode.SAME_STEP:
+                self._waiting, self._last = ends, extras["final_observations"]
+            elif env.final:
+                info |= _final(env, extras["final_observations"], ends, tensors)
+            parts = (rewards, ends & ~late, late)
             plain = parts if tensors else tuple(part.cpu().numpy() for part in parts)
-            return _plain(env, observed, tensors), *plain, info
+            return _plain(env, self._shown(observed), tensors), *plain, info
+
+        def _shown(self, observed: Any) -> Any:
+            """Return observations, the last ones of their episode in worlds that wait."""
+            if self._last is None:
+                return observed
+            waits = self._waiting[:, None]
+            return {name: torch.where(waits, self._last[name], observed[name]) for name in env.num_obs}
 
     return VectorWorlds()
+
+
+def _by_world(log: dict[str, torch.Tensor], worlds: int, tensors: bool) -> dict[str, Any]:
+    """Return a log of all worlds as Gymnasium has information: an array [world] by name."""
+    if tensors:
+        return {name: value.repeat(worlds) for name, value in log.items()}
+    values = torch.stack([*log.values()]).cpu().numpy()
+    return {name: np.full(worlds, value) for name, value in zip(log, values, strict=True)}
+
+
+def _final(env: Env, observed: Any, ends: torch.Tensor, tensors: bool) -> dict[str, Any]:
+    """Return the information on last observations: arrays of all worlds as tensors, else Gymnasium's array of objects.
+
+    That one has the observation of a world where its episode ended and None elsewhere; it is left out if none ended.
+    """
+    found = _plain(env, observed, tensors)
+    if tensors:
+        return {"final_obs": found, "_final_obs": ends}
+    held, own = ends.cpu().numpy(), np.full(env.num_envs, None, dtype=object)
+    for world in np.flatnonzero(held):
+        own[world] = _of_world(found, world)
+    return {"final_obs": own, "_final_obs": held} if held.any() else {}
+
+
+def _of_world(found: Any, world: Any) -> Any:
+    """Return one world's observation of those of all, by group or of the only one."""
+    return {name: x[world] for name, x in found.items()} if isinstance(found, dict) else found[world]
 
 
 def make_single(env: Env) -> Any:
@@ -84,28 +161,24 @@ def make_single(env: Env) -> Any:
         metadata = {"render_modes": []}  # noqa: RUF012
 
         def __init__(self) -> None:
-            self.env = env
+            self.env, self._ended = env, False
             self.observation_space, self.action_space = _spaces(env)
 
         def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
-            """Start anew."""
+            """Start anew; with a seed as a new environment of that seed."""
             super().reset(seed=seed)
-            if seed is not None:
-                env.set_seed(seed)
-            return self._first(env.reset()[0]), {}
+            if seed is not None or not self._ended:  # otherwise the world has started anew
+                env.reset(seed=seed)
+            self._ended = False
+            return _of_world(_plain(env, env.get_observations(), False), 0), {}
 
         def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
             """Take a step."""
             given = torch.as_tensor(np.asarray(action, dtype=np.float32))[None].to(env.device)
-            _, rewards, done, extras = env.step(given)
-            late = bool(extras["time_outs"][0])
-            observed = self._first(extras["final_observations"])
-            return observed, float(rewards[0]), bool(done[0]) and not late, late, {}
-
-        @staticmethod
-        def _first(observed: Any) -> Any:
-            found = _plain(env, observed, False)
-            return {name: x[0] for name, x in found.items()} if isinstance(found, dict) else found[0]
+            observed, rewards, done, extras = env.step(given)
+            late, self._ended = bool(extras["time_outs"][0]), bool(done[0])
+            seen = _of_world(_plain(env, extras["final_observations"] if self._ended else observed, False), 0)
+            return seen, float(rewards[0]), self._ended and not late, late, {}
 
     return SingleWorldEnv()
 

@@ -46,11 +46,20 @@ class Storage:
         self.controls: dict[str, torch.Tensor] = {}
         self.written: dict[str, torch.Tensor] = {}
         self.values: dict[str, torch.Tensor] = {}
+        self._firsts: dict[str, torch.Tensor] = {}  # of a world, before the first step; others are zeros
         self._add_state(layout)
         self._add_controls(layout, read)
         self._add_measured(layout, read)
         self._add_numbers(layout, tables)
         self._add_results(results, apart)
+        self.clear()
+
+    def clear(self) -> None:
+        """Set all that steps change to what it is before the first: default coordinates, the scene's values, zeros."""
+        for tensor in (*self.changing().values(), *self.written.values()):
+            tensor.zero_()
+        for name, first in self._firsts.items():
+            self.tensors[name].copy_(first)
 
     def part(self, out: torch.Tensor, name: str) -> torch.Tensor:
         """Return a result in a copy of ``out`` [world, entries]."""
@@ -66,6 +75,12 @@ class Storage:
         results = {self._output(name) for name in self.places}
         own = {name for name, buffer in self.buffers.items() if buffer.memory_order != SHARED} | {"key"}
         return {name: x for name, x in self.tensors.items() if name in own - results} | {"out": self.out}
+
+    def worlds_of(self) -> dict[str, tuple[torch.Tensor, int]]:
+        """Return the tensors of worlds that steps change and read again, each with its axis of worlds, by name."""
+        own = {name: buffer for name, buffer in self.buffers.items() if buffer.memory_order != SHARED}
+        results = {self._output(name) for name in self.places}
+        return {n: (self.tensors[n], int(b.memory_order == COLUMN)) for n, b in own.items() if n not in results}
 
     @property
     def bytes_per_world(self) -> int:
@@ -84,8 +99,8 @@ class Storage:
 
     def _add_state(self, layout: MemoryLayout) -> None:
         worlds, scene = self.worlds, layout.scene
-        default = torch.tensor(layout.default_q, dtype=torch.float32, device=self.device)
-        self._add("q", default.repeat(worlds, 1))
+        self._firsts["q"] = torch.tensor(layout.default_q, dtype=torch.float32, device=self.device)
+        self._add("q", self._zeros(worlds, scene.coord_count))
         self._add("qd", self._zeros(worlds, scene.dof_count))
         self._add("actions", self._zeros(worlds, layout.action_count))
         self._add("memory", self._zeros(max(1, layout.memory_size), worlds), COLUMN)
@@ -101,7 +116,7 @@ class Storage:
         for name in sorted(layout.action_arrays):
             self.controls[name] = self._add(name, self._zeros(self.worlds, sizes[name]))
         if "target_q" in self.controls:
-            self.controls["target_q"].copy_(self.tensors["q"])
+            self._firsts["target_q"] = self._firsts["q"]
         if "actuator_force" in read:
             self._add("actuator_force", self._zeros(self.worlds, scene.dof_count))
 
@@ -128,7 +143,8 @@ class Storage:
             self._add(name, flat, SHARED)
         for name in layout.values:
             own = torch.tensor(layout.scene.values[name][0], dtype=torch.float32, device=self.device)
-            self.values[name] = self._add(f"value_{name}", own.expand(self.worlds, *own.shape).contiguous())
+            self._firsts[f"value_{name}"] = own
+            self.values[name] = self._add(f"value_{name}", self._zeros(self.worlds, *own.shape))
         if layout.users:
             self._add("user", self._zeros(self.worlds, layout.user_size))
 
