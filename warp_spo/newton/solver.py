@@ -32,6 +32,7 @@ from .observables import ObservableArrays, Observables
 from .pairs import ModelPairs, find_pairs, warn_of_bodies_apart
 from .resets import reset_state
 from .slots import SLOT_VALUES, ContactSlots
+from .soft_shapes import warn_of_soft_shapes
 from .tape import StepGradients, paused_tape, refuse_tape
 from .worlds import WorldRows
 
@@ -170,10 +171,11 @@ class SolverSPO(MassMatrixInterface, SolverBase):
         self._contact_options, self._pairs_asked, self._passes = (contacts, points), pairs, passes
         self._options: dict[str, Any] = {"loops": loops, "granularity": granularity}
         with paused_tape():
-            self._build()
+            made = self._build()
+        warn_of_soft_shapes(model, points, *made)
 
-    def _build(self) -> None:
-        """Compile and allocate everything for the model as it is now."""
+    def _build(self) -> tuple[WorldRows, Scene, ModelContacts | ContactSlots | None, ModelPairs | None]:
+        """Compile and allocate everything for the model as it is now; return its rows, scene and contacts."""
         model = self.model
         scene = from_newton(model)
         if scene.couplings and self._options["loops"] == "raise":
@@ -213,6 +215,7 @@ class SolverSPO(MassMatrixInterface, SolverBase):
             model, self.dynamics, state, self._joint_forces, self._drives, self._arrays, self._passes, self._empty_slots
         )
         self._prepare()
+        return worlds, scene, touching, pairs
 
     def _contacts_of(
         self, worlds: WorldRows, scene: Scene
