@@ -1,6 +1,9 @@
 """Where Newton's own parts take their inertia from SolverSPO; Isaac Lab by a stand-in of the interface it documents."""
 
+import contextlib
 import dataclasses
+import re
+from pathlib import Path
 
 import newton
 import numpy as np
@@ -9,6 +12,8 @@ import warp as wp
 from newton.actuators import JointSpaceResponse
 from newton.controllers import ControllerOperationalSpaceModelFree
 
+import warp_spo.newton
+from benchmarks.blocks import ROOT
 from support.newton_models import arm
 from support.solver_models import floating, moving, replicated
 from warp_spo.newton import SolverSPO
@@ -135,3 +140,15 @@ def test_isaac_labs_four_slots(made):
     state = moving(model)
     solver.step(state, state, None, None, 1e-3)
     assert np.isfinite(state.joint_q.numpy()).all()
+
+
+def test_an_older_newton_is_refused_by_its_version(monkeypatch):
+    """The lowest version is that of the dependencies."""
+    (wanted,) = re.findall(r'"newton>=([\d.]+)"', (ROOT / "pyproject.toml").read_text())
+    assert wanted == warp_spo.newton.LOWEST
+    for version, refused in (("1.6.1", True), ("1.7.9", True), ("1.8.0", False), ("1.10.0", False), ("unknown", False)):
+        monkeypatch.setattr(newton, "__version__", version)
+        name = {"__name__": "warp_spo.newton", "__package__": "warp_spo.newton"}
+        words = rf"Newton {version} is installed; expected {wanted} or newer: pip install 'newton>={wanted}'"
+        with pytest.raises(ImportError, match=words) if refused else contextlib.nullcontext():
+            exec(Path(warp_spo.newton.__file__).read_text(), name)

@@ -1,9 +1,13 @@
 """SolverSPO as a solver of Isaac Lab's Newton manager.
 
-Isaac Lab's classes are arguments here, because importing them needs a running simulator::
+Isaac Lab's classes are arguments here, so that this library does not depend on it; its packages import without a
+running simulator::
 
     from isaaclab_newton.physics import NewtonManager, NewtonSolverCfg
     Manager, Cfg = adapter(NewtonManager, NewtonSolverCfg)
+
+Isaac Lab 3.0 pins Newton 1.6.1. SolverSPO needs 1.8, because earlier solvers have no observables (1.7) and models no
+tendons that it could refuse: an installation of both overrides that pin, which Isaac Lab does not promise to bear.
 """
 
 from __future__ import annotations
