@@ -1,6 +1,7 @@
 """Benchmarks: error and run time of every operation on a handful of robots. ``python -m benchmarks --help``.
 
-Each file that is a command says so in its first lines; CONTRIBUTING.md has the usual calls.
+Each file that is a command says so in its first lines; CONTRIBUTING.md has the usual calls. ``command_line`` holds the
+arguments that commands share.
 
 The table of results:
     ``rows`` runs it, ``table/`` is the library behind it, ``peers/`` is what other libraries compute.

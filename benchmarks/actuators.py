@@ -9,10 +9,8 @@ of captured steps from one state, see ``benchmarks.capabilities``; a row with su
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +19,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.dynamics.trial_inputs import rotations
 
+from . import command_line
 from .capabilities import SETS, measure_time
 from .table import runner
 from .table.cases import SCENES
@@ -109,12 +108,10 @@ def measure(scene: spo.Scene, row: str, worlds: int, device: wp.Device) -> dict[
 
 def main(arguments: list[str] | None = None) -> int:
     """Print the rows of all scenes and world counts."""
-    parser = argparse.ArgumentParser(prog="benchmarks.actuators", description="What actuators cost a step.")
-    parser.add_argument("--device", help="Warp device, default: the current one")
+    parser = command_line.parser("actuators", __doc__)
     parser.add_argument("--scenes", nargs="+", default=["go2"], choices=SCENES)
     parser.add_argument("--worlds", nargs="+", type=int, default=[4096, 65536])
     parser.add_argument("--only", default="", help="rows whose name has this text")
-    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args(arguments)
     device, worst = wp.get_device(options.device), 0.0
     found: list[dict] = []

@@ -10,12 +10,10 @@ repetitions, see ``benchmarks.capabilities``. A kernel's registers and stack are
 
 from __future__ import annotations
 
-import argparse
 import functools
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -28,6 +26,7 @@ from warp_spo.reference.dense import Dense
 from warp_spo.runtime import launches
 from warp_spo.trials.inputs import TOLERANCE, Inputs
 
+from . import command_line
 from .capabilities import SETS, measure_time
 from .table import robots, runner
 
@@ -131,15 +130,13 @@ class Case:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="benchmarks.breakdown", description=(__doc__ or "").split("\n")[0])
+    parser = command_line.parser("breakdown", __doc__)
     parser.add_argument("operation", nargs="?", choices=tuple(READS), default="forward_dynamics_derivatives")
-    parser.add_argument("--device", help="Warp device, default: the current one")
     parser.add_argument("--robots", nargs="+", default=list(robots.ROBOTS))
     parser.add_argument("--worlds", nargs="+", type=int, default=[4096, 65536])
     parser.add_argument("--dtype", choices=("float32", "float64"), default="float32")
     parser.add_argument("--granularity", choices=("tree", "segment"), help="default: the plan's choice")
     parser.add_argument("--check", action="store_true", help="compile and compare, but take no times")
-    parser.add_argument("--json", type=Path, help="write the rows there")
     options = parser.parse_args(arguments)
     rows: list[dict] = []
     device, wrong = wp.get_device(options.device), 0

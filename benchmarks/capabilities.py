@@ -18,14 +18,12 @@ results are checked to be finite.
 
 from __future__ import annotations
 
-import argparse
 import functools
 import gc
 import re
 import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,6 +33,7 @@ import warp_spo as spo
 from warp_spo.trials.inputs import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, TrialRun, all_finite
 
+from . import command_line
 from .table import process_turns, robots, runner
 
 DT = 2e-3  # [s]
@@ -266,11 +265,9 @@ def _measure(task: tuple[str, str, int, str], turn: process_turns.Turn | None = 
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="benchmarks.capabilities", description=(__doc__ or "").split("\n")[0])
+    parser = command_line.parser("capabilities", __doc__)
     parser.add_argument("pattern", nargs="?", default="", help="regular expression on 'group name'")
-    parser.add_argument("--device", help="Warp device, default: the current one")
     parser.add_argument("--worlds", nargs="+", type=int, default=[4096, 65536])
-    parser.add_argument("--json", type=Path, help="write the rows there")
     parser.add_argument("--jobs", type=int, help="processes that prepare; default: the number of cores")
     parser.add_argument("--seconds", type=float, default=3600.0, help="time for all of it, default: 3600")
     options = parser.parse_args(arguments)

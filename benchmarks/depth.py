@@ -37,6 +37,7 @@ from warp_spo.trials.inputs import OPERATIONS, Inputs
 from warp_spo.trials.trial import Subject, TrialRun
 from warp_spo.viewing import charts
 
+from . import command_line
 from .table import runner
 from .table.resources import record_launches
 from .table.shapes import Recursive, chain, random_tree
@@ -64,14 +65,12 @@ ON_A_CPU = [("chain", 256, 1), ("tether", 64, 16), ("tree", 256, 1)]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="benchmarks.depth", description="Scans along deep trees beside sweeps.")
-    parser.add_argument("--device", help="Warp device, default: the current one")
+    parser = command_line.parser("depth", __doc__, json="file or folder for the rows")
     parser.add_argument("--dtype", nargs="+", default=["float32"], choices=TOLERANCE)
     parser.add_argument("--bodies", nargs="+", type=int, help="of chains; with it no other scene is timed")
     parser.add_argument("--worlds", nargs="+", type=int)
     parser.add_argument("--columns", nargs="+", help="those to time; default: all; tree takes minutes to compile")
     parser.add_argument("--parts", action="store_true", help="time motion, factors and solution by themselves, too")
-    parser.add_argument("--json", type=Path, help="file or folder for the rows")
     parser.add_argument("--draw", nargs=2, type=Path, metavar=("JSON", "SVG"), help="draw the rows of a file, no more")
     options = parser.parse_args(arguments)
     if options.draw is not None:

@@ -10,14 +10,12 @@ as a learner calls it, steps in a row. Without a GPU all three are times of call
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import statistics
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -25,6 +23,8 @@ import torch
 from warp_spo import env as envs
 from warp_spo.env import learning
 from warp_spo.env.tasks import TASKS
+
+from . import command_line
 
 TURNS, REPLAYS, DRIVEN = 5, 40, 40
 AGREED = 3  # steps after which a CPU and a GPU are compared; later they part, as falls differ
@@ -122,13 +122,9 @@ def compare(task: str, device: Any, worlds: int = 256) -> dict[str, Any]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="benchmarks.env_times", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line.parser("env_times", __doc__)
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=["go2-flat", "go2-rough", "g1-flat"])
     parser.add_argument("--worlds", type=int, nargs="+", default=[4096, 16384, 65536])
-    parser.add_argument("--device")
-    parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     device, results = learning.pick_device(options.device), {}
     for worlds in options.worlds:

@@ -11,11 +11,9 @@ graph of many calls on sets of inputs in turn, see ``benchmarks.capabilities``.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +22,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.examples import crane
 
+from . import command_line
 from .capabilities import SETS, measure_time
 from .table import runner
 from .table.resources import record_launches, resources
@@ -91,14 +90,12 @@ def measure(scene: spo.Scene, operation: str, worlds: int, dtype: str, device: w
 
 def main(arguments: list[str] | None = None) -> int:
     """Print a row for each operation and world count."""
-    parser = argparse.ArgumentParser(prog="benchmarks.flexible", description="Dynamics of a crane that bends.")
-    parser.add_argument("--device", help="Warp device, default: the current one")
+    parser = command_line.parser("flexible", __doc__, json="file or folder for the rows")
     parser.add_argument("--worlds", nargs="+", type=int, default=[4096, 65536])
     parser.add_argument("--operations", nargs="+", default=OPERATIONS, choices=OPERATIONS)
     parser.add_argument("--modes", default="six", choices=MODES)
     parser.add_argument("--points", type=int, default=5, help="that carry the mass of each beam")
     parser.add_argument("--dtype", default="float32", choices=TOLERANCE)
-    parser.add_argument("--json", type=Path, help="file or folder for the rows")
     options = parser.parse_args(arguments)
     device, scene = wp.get_device(options.device), crane.scene(MODES[options.modes], options.points)
     rows: list[dict] = []

@@ -17,7 +17,6 @@ most 5 % above the least.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import importlib.metadata
 import io
@@ -35,7 +34,7 @@ import warp as wp
 
 from warp_spo.viewing import charts
 
-from . import boom
+from . import boom, command_line
 from .boom import Simulation
 from .table import runner
 from .table.pictures import pareto
@@ -207,10 +206,9 @@ def picture(rows: list[dict]) -> Any:
 
 def main(arguments: list[str] | None = None) -> int:
     """Print a row for each model and step."""
-    parser = argparse.ArgumentParser(prog="benchmarks.flexible_peers", description="Flexible bodies beside peers.")
+    parser = command_line.parser("flexible_peers", __doc__, device=False, json="file or folder for the rows")
     parser.add_argument("--models", default="", metavar="REGEX", help="of rows, such as 'Newton|1 body'")
     parser.add_argument("--dt", nargs="+", type=float, default=STEPS, help="steps [ms]")
-    parser.add_argument("--json", type=Path, help="file or folder for the rows")
     parser.add_argument("--write", action="store_true", help=f"draw docs/_static/{PICTURE.name}")
     options = parser.parse_args(arguments)
     try:

@@ -17,7 +17,6 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +25,7 @@ import warp as wp
 
 import warp_spo as spo
 
+from . import command_line
 from .table import robots, runner
 from .table.cases import SCENES
 
@@ -61,14 +61,12 @@ class Row(NamedTuple):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="benchmarks.host_time", description="How long calls occupy the host.")
-    parser.add_argument("--device", help="Warp device, default: the current one")
+    parser = command_line.parser("host_time", __doc__)
     parser.add_argument("--scene", default="go2", choices=SCENES)
     parser.add_argument("--worlds", type=int, default=4096)
     parser.add_argument("--granularity", help="default: the plan's choice")
     parser.add_argument("--backend", default="inductor", help="of torch.compile")
     parser.add_argument("--only", default="", help="rows whose name has this text")
-    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args(arguments)
     device = wp.get_device(options.device)
     scene = SCENES[options.scene]()

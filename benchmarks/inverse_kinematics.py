@@ -13,11 +13,9 @@ exit code is 1 if ours reaches less than 99 % of the targets at its default numb
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +24,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.dynamics.inverse_kinematics import ITERATIONS, starts
 
+from . import command_line
 from .table import arms, runner
 
 DISTANCE, ANGLE = 1e-3, np.radians(0.1)  # [m, rad] within which a target is reached
@@ -156,13 +155,11 @@ def newtons(problem: Problem, iterations: int) -> dict[str, Any]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="benchmarks.inverse_kinematics", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--device", help="Warp device, default: the current one")
+    parser = command_line.parser("inverse_kinematics", __doc__)
     parser.add_argument("--arms", nargs="+", default=list(arms.ARMS), choices=list(arms.ARMS))
     parser.add_argument("--targets", type=int, default=4096)
     parser.add_argument("--seeds", type=int, default=16)
     parser.add_argument("--without-newton", action="store_true", help="measure ours alone")
-    parser.add_argument("--json", type=Path, help="write the rows there")
     options = parser.parse_args(arguments)
     device = wp.get_device(options.device)
     rows: list[dict] = []

@@ -8,16 +8,16 @@ step. First the first device runs alone, then all at once; then one device runs 
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import torch
 import torch.multiprocessing as processes
 import warp as wp
+
+from . import command_line
 
 CHECKED, TIMED, WARM = 50, 400, 50  # steps whose states are compared; steps that are timed; steps before
 PATIENCE = 300.0  # s
@@ -74,11 +74,10 @@ def together(task: str, devices: list[str], worlds: int) -> list[tuple]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line.parser("many_gpus", __doc__, device=False)
     parser.add_argument("--task", default="go2-flat")
     parser.add_argument("--devices", nargs="+", default=["cuda:0", "cuda:1"])
     parser.add_argument("--worlds", type=int, default=4096, help="of each device")
-    parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     devices, worlds = options.devices, options.worlds
     (alone,) = together(options.task, devices[:1], worlds)

@@ -10,7 +10,6 @@ that has no more. The exit code is 1 if a choice takes more than ``ALLOWED`` tim
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import gc
@@ -32,6 +31,7 @@ from warp_spo.execution.device_facts import DeviceFacts, read_facts
 from warp_spo.trials.inputs import OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, TrialRun
 
+from . import command_line
 from .capabilities import DT, KD, KE
 from .table import process_turns, robots, runner
 from .table.occupied_gpu import crowd
@@ -211,14 +211,12 @@ def as_on(facts: DeviceFacts) -> Iterator[None]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="benchmarks.plans", description="Compare the plan's choice with the best.")
-    parser.add_argument("--device", help="Warp device, default: the current one")
+    parser = command_line.parser("plans", __doc__)
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES, metavar="S", help=", ".join(SCENES))
     parser.add_argument("--operations", nargs="+", choices=NAMES, default=NAMES, metavar="O", help=", ".join(NAMES))
     parser.add_argument("--worlds", nargs="+", type=int, default=WORLDS)
     parser.add_argument("--leave", type=int, metavar="N", help="multiprocessors that others do not occupy")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes that prepare; default: all cores")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
     parser.add_argument("--seconds", type=float, default=3600.0, help="time for all of it, default: 3600")
     parser.add_argument("--compile", action="store_true", help="compile the kernels, and time nothing")
     options = parser.parse_args(arguments)

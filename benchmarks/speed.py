@@ -16,7 +16,6 @@ a line is missing; a limit that is missed is printed, and is no error.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import functools
 import gc
@@ -34,7 +33,7 @@ import warp_spo as spo
 from warp_spo.trials.inputs import APPLICATIONS, OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, TrialRun
 
-from . import limits, step_parts, substeps
+from . import command_line, limits, step_parts, substeps
 from .contact import scenes
 from .contact import steps as contact_steps
 from .limits import (
@@ -207,10 +206,8 @@ def _time(task: tuple[str, tuple[int, ...], list[Call]], turn: Turn) -> Iterator
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="benchmarks.speed", description="Times beside limits.")
+    parser = command_line.parser("speed", __doc__)
     parser.add_argument("pattern", nargs="?", default="", help="regular expression on the names of lines")
-    parser.add_argument("--device", help="Warp device, default: the current one")
-    parser.add_argument("--json", type=Path, help="file for the rows, written after each line")
     parser.add_argument("--compile", action="store_true", help="compile all kernels, and time nothing")
     parser.add_argument("--seconds", type=float, default=3600.0, help="time for all of it, default: 3600")
     parser.add_argument("--table", type=Path, metavar="FILE", help="print a saved run as a page, and run nothing")

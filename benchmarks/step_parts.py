@@ -12,11 +12,9 @@ step from random states against float64 on the CPU.
 
 from __future__ import annotations
 
-import argparse
 import functools
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import newton
@@ -28,6 +26,7 @@ from warp_spo.newton import SolverSPO, from_newton
 from warp_spo.newton.drives import Drives
 from warp_spo.trials.trial import Timing
 
+from . import command_line
 from .capabilities import DT, KD, KE, SETS, inputs, measure_time
 from .table import robots, runner
 from .table.resources import record_launches, resources
@@ -214,11 +213,9 @@ def describe(row: dict[str, Any]) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="benchmarks.step_parts", description=(__doc__ or "").split("\n")[0])
+    parser = command_line.parser("step_parts", __doc__)
     parser.add_argument("robots", nargs="*", default=list(NAMES))
-    parser.add_argument("--device", help="Warp device, default: the current one")
     parser.add_argument("--worlds", nargs="+", type=int, default=[4096, 16384])
-    parser.add_argument("--json", type=Path, help="write the rows there")
     options = parser.parse_args(arguments)
     rows: list[dict] = []
     run, device = runner.record(rows, options.device), wp.get_device(options.device)

@@ -8,10 +8,8 @@ have contacts, see :mod:`benchmarks.contact.scenes`. Worlds start at random in a
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +18,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.scene.scene import Scene
 
-from . import step_parts
+from . import command_line, step_parts
 from .capabilities import SETS, measure_time
 from .contact import scenes
 from .table import runner
@@ -104,12 +102,10 @@ def prepare(name: str, worlds: int, device: wp.Device, count: int) -> Callable[[
 
 def main(arguments: list[str] | None = None) -> int:
     """Print a line for each robot, number of worlds and of substeps."""
-    parser = argparse.ArgumentParser(prog="benchmarks.substeps", description=(__doc__ or "").split("\n")[0])
+    parser = command_line.parser("substeps", __doc__)
     parser.add_argument("robots", nargs="*", default=list(NAMES))
-    parser.add_argument("--device", help="Warp device, default: the current one")
     parser.add_argument("--worlds", nargs="+", type=int, default=[4096, 16384])
     parser.add_argument("--counts", nargs="+", type=int, default=[4, 10])
-    parser.add_argument("--json", type=Path, help="write the rows there")
     options = parser.parse_args(arguments)
     rows: list[dict] = []
     run, device = runner.record(rows, options.device), wp.get_device(options.device)

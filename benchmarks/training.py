@@ -9,13 +9,11 @@ largest number that torch held while it trained, less what it held before: netwo
 
 from __future__ import annotations
 
-import argparse
 import gc
 import json
 import statistics
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -25,6 +23,8 @@ from tensordict import TensorDict
 from warp_spo import env as envs
 from warp_spo.env import learning
 from warp_spo.env.tasks import task
+
+from . import command_line
 
 WARM, ITERATIONS = 4, 12
 
@@ -100,11 +100,9 @@ def wait(device: Any) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line.parser("training", __doc__)
     parser.add_argument("--task", default="go2-flat")
     parser.add_argument("--worlds", type=int, nargs="+", default=[4096, 16384])
-    parser.add_argument("--device")
-    parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     device, learner, results = learning.pick_device(options.device), task(options.task).LEARNER, {}
     for worlds in options.worlds:

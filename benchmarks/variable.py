@@ -7,7 +7,6 @@ variable values and the time that setting them takes. Results are compared with 
 if an error exceeds its tolerance.
 """
 
-import argparse
 import sys
 import time
 from typing import Any
@@ -18,6 +17,7 @@ import warp_spo as spo
 from warp_spo.trials.inputs import OPERATIONS, TOLERANCE, Inputs
 from warp_spo.trials.trial import Subject, TrialRun
 
+from . import command_line
 from .table.cases import SCENES
 from .table.resources import record_launches, resources
 
@@ -28,8 +28,7 @@ REPEATS, WARM_UP, BUDGET = 10, 0.02, 0.2
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="benchmarks.variable", description="The cost of variable inertias.")
-    parser.add_argument("--device", help="Warp device, default: the current one")
+    parser = command_line.parser("variable", __doc__, json="")
     parser.add_argument("--scenes", nargs="+", default=["panda", "go2", "g1"])
     parser.add_argument("--worlds", nargs="+", type=int, default=[1, 4096, 1048576])
     parser.add_argument(

@@ -11,7 +11,6 @@ gradients say. Every jump is where the first touch moves to another step.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 from pathlib import Path
@@ -26,6 +25,7 @@ from warp_spo.dynamics.stepping.step import STEP
 from warp_spo.scene.ground import HEIGHTS
 from warp_spo.viewing.charts import OTHER, OURS
 
+from .. import command_line
 from ..capabilities import SETS, measure_time
 from . import scenes
 
@@ -151,14 +151,12 @@ def draw(path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="benchmarks.contact.gradients", description=__doc__.split("\n")[0])
+    parser = command_line.parser("contact.gradients", __doc__)
     parser.add_argument("robots", nargs="*", default=["go2"], help="go2, g1, ant")
-    parser.add_argument("--device", default=None)
     parser.add_argument("--worlds", type=int, nargs="+", default=[4096])
     parser.add_argument("--ground", choices=["plane", "rough"], nargs="+", default=["plane", "rough"])
     parser.add_argument("--passes", type=int, nargs="+", default=[3])
     parser.add_argument("--heights", action="store_true", help="gradients by the heights of the rough ground, too")
-    parser.add_argument("--json", type=Path)
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
     if options.picture:

@@ -9,12 +9,10 @@ the effort limits of its file, Go2 four spheres and the corners of its trunk, 60
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +20,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.reference.contact import ContactStep
 
+from .. import command_line
 from ..table import robots
 from . import scenes
 from .courses import courses
@@ -311,12 +310,9 @@ LINES: dict[str, Callable[[], Iterator[Line]]] = {"g1": g1_lines, "field": field
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="benchmarks.contact.motions", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line.parser("contact.motions", __doc__, device=False)
     every = LINES | {name: (lambda f=f: (Line(*row) for row in f())) for name, f in courses().items()}
     parser.add_argument("names", nargs="*", help=f"among {', '.join(every)}; all if there are none")
-    parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     unknown = [name for name in options.names if name not in every]
     if unknown:

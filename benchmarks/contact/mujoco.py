@@ -10,7 +10,6 @@ solref and solimp.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -23,6 +22,7 @@ import numpy as np
 import warp_spo as spo
 from warp_spo.viewing import charts
 
+from .. import command_line
 from ..table import robots
 from .motions import BENT
 from .scenes import SOLE
@@ -228,10 +228,7 @@ def draw(found: dict[str, Any], path: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="benchmarks.contact.mujoco", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--json", type=Path)
+    parser = command_line.parser("contact.mujoco", __doc__, device=False)
     parser.add_argument("--picture", type=Path)
     parser.add_argument("--draw", type=Path, metavar="FILE.json", help="draw results that were measured before")
     options = parser.parse_args(arguments)

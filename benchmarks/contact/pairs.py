@@ -9,12 +9,10 @@ between each two calves, which cross in half of the worlds. dt is 5 ms; steps wi
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +23,7 @@ from warp_spo.examples import grasp
 from warp_spo.reference.body_contact import PairStep
 from warp_spo.reference.contact import ContactStep
 
+from .. import command_line
 from ..capabilities import SETS, measure_time
 from . import scenes
 
@@ -133,13 +132,9 @@ def measure(name: str, worlds: int, device: wp.Device, passes: int | None = None
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="benchmarks.contact.pairs", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--device", default=None)
+    parser = command_line.parser("contact.pairs", __doc__)
     parser.add_argument("--worlds", type=int, nargs="+", default=[4096, 65536])
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
-    parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     device, results = wp.get_device(options.device), {}
     runs = [(name, worlds, None) for name, worlds in itertools.product(options.cases, options.worlds)]

@@ -19,7 +19,6 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,6 +27,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.env import robots
 
+from .. import command_line
 from ..capabilities import median_replay
 from ..table import process_turns
 
@@ -290,10 +290,7 @@ def tasks_of(options: argparse.Namespace) -> list[Task]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="benchmarks.contact.peers", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--device", default=None)
+    parser = command_line.parser("contact.peers", __doc__)
     parser.add_argument("--worlds", type=int, nargs="+", default=[4096, 16384])
     parser.add_argument("--groups", nargs="+", choices=GROUPS, default=list(GROUPS))
     parser.add_argument("--robots", nargs="+", choices=sorted({*FILES, *MODELS}), help="left out: all of a group")
@@ -301,7 +298,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--no-errors", action="store_true", help="times only")
     parser.add_argument("--seconds", type=float, default=3600.0, help="after which rows that are left are not measured")
     parser.add_argument("--jobs", type=int, help="processes side by side; left out: one for each core")
-    parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     tasks = tasks_of(options)
     rows: dict[tuple[str, str, str], dict[str, Any]] = {}

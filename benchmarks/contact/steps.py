@@ -9,12 +9,10 @@ Robots are those of :mod:`.scenes`; worlds stand on the ground in different stat
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +21,7 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.reference.contact import ContactStep
 
+from .. import command_line
 from ..capabilities import measure_time
 from .scenes import DT, force_array, subject
 
@@ -80,17 +79,13 @@ def prepare(
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="benchmarks.contact.steps", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--device", default=None)
+    parser = command_line.parser("contact.steps", __doc__)
     parser.add_argument("--worlds", type=int, nargs="+", default=[4096, 65536])
     parser.add_argument("--robots", nargs="+", default=["go2", "g1"], help="go2, g1, ant")
     parser.add_argument("--granularity", nargs="+", default=["planned"], help="planned, tree, segment")
     parser.add_argument("--dtype", nargs="+", default=["float32"])
     parser.add_argument("--ground", nargs="+", choices=GROUNDS, default=["plane", "field"])
     parser.add_argument("--passes", type=int, nargs="+", default=[3])
-    parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     device, results = wp.get_device(options.device), {}
     for dtype, robot, worlds, form, ground, passes in itertools.product(

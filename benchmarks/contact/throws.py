@@ -8,17 +8,16 @@ limits; once without drives, once with them. A world whose state is not finite m
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import warp as wp
 
 import warp_spo as spo
 
+from .. import command_line
 from . import scenes
 
 DT, SECONDS, CHUNK = 1e-2, 1.0, 2**17
@@ -106,13 +105,9 @@ def throw(scene: spo.Scene, worlds: int, passes: int, device: str, seed: int) ->
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="benchmarks.contact.throws", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--device", default=None)
+    parser = command_line.parser("contact.throws", __doc__)
     parser.add_argument("--worlds", type=int, default=2**20)
     parser.add_argument("--passes", type=int, nargs="+", default=[3, 4])
-    parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     device, rows = str(wp.get_device(options.device)), {}
     driven = scenes.scene("g1")
