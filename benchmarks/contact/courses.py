@@ -57,16 +57,9 @@ def run(
     gap, target = np.zeros((worlds, points)), q.copy()
     k = scene.values["contact_stiffness"] if k is None else k
     energies, gaps = [], []
+    options, report = spo.StepOptions(passes=passes), spo.StepReport(contact_gap=gap)
     for _ in range(round(seconds / dt)):
-        after = dyn.step(
-            q,
-            qd,
-            None,
-            dt,
-            target_q=target,
-            options=spo.StepOptions(passes=passes),
-            report=spo.StepReport(contact_gap=gap),
-        )
+        after = dyn.step(q, qd, None, dt, target_q=target, options=options, report=report)
         energy = dyn.kinetic_energy(q, qd) + dyn.potential_energy(q)
         energy = energy + 0.5 * (k * np.maximum(-gap, 0.0) ** 2).sum(axis=1)
         energies.append(energy + (springs(scene, q, target) if scene.dof_count > 6 else 0.0))

@@ -55,16 +55,8 @@ def measure(
     outs = [wp.empty(dyn._gradients.shape_of(STEP, name), dtype=dyn.dtype, device=device) for name in wrt]
 
     def step(i: int) -> None:
-        one = given[i]
-        dyn.step(
-            one["q"],
-            one["qd"],
-            one["tau"],
-            DT,
-            report=spo.StepReport(qdd=one["qdd"]),
-            options=spo.StepOptions(passes=passes),
-            out=out,
-        )
+        one, options = given[i], spo.StepOptions(passes=passes)
+        dyn.step(one["q"], one["qd"], one["tau"], DT, report=spo.StepReport(qdd=one["qdd"]), options=options, out=out)
 
     def back(i: int) -> None:
         dyn._gradients.launch(derivative_of(STEP), wrt, outs, {**given[i], "dt": DT, "passes": passes})

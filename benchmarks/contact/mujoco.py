@@ -101,31 +101,14 @@ def ours(scene: spo.Scene, q0: np.ndarray, ctrl: np.ndarray, dt: float, passes: 
     base = next(i for i, label in enumerate(scene.body_labels) if label.endswith("pelvis"))
     at = np.array([point.position for point in scene.contact_points])
     places, pressures, spent = [], [], 0.0
-    dyn.step(
-        q,
-        qd,
-        None,
-        dt,
-        ctrl=controls,
-        body_f=body_f,
-        options=spo.StepOptions(passes=passes),
-        report=spo.StepReport(contact_f=force),
-    )
+    more: dict[str, Any] = dict(options=spo.StepOptions(passes=passes), report=spo.StepReport(contact_f=force))
+    dyn.step(q, qd, None, dt, ctrl=controls, body_f=body_f, **more)
     for period in range(round(seconds / 1e-2)):
         body_f[:, base, 0] = push * (BEGIN - 1e-9 <= period * 1e-2 < END - 1e-9)
         began = time.perf_counter()
         for _ in range(every):
             before = q
-            q, qd = dyn.step(
-                q,
-                qd,
-                None,
-                dt,
-                ctrl=controls,
-                body_f=body_f,
-                options=spo.StepOptions(passes=passes),
-                report=spo.StepReport(contact_f=force),
-            )
+            q, qd = dyn.step(q, qd, None, dt, ctrl=controls, body_f=body_f, **more)
         spent += time.perf_counter() - began
         places.append(q[0, :3].copy())
         poses = dyn.body_poses(before)[0]

@@ -72,18 +72,9 @@ def throw(scene: spo.Scene, worlds: int, passes: int, device: str, seed: int) ->
     found |= {"steps": 0, "worlds": worlds, "not finite": 0, "not finite without status": 0, "worst rise": -np.inf,
               "steps with status CONTACT": 0}  # fmt: skip
     seen, began = torch.zeros(worlds, dtype=torch.bool, device=where), time.perf_counter()
+    options, report = spo.StepOptions(passes=passes), spo.StepReport(contact_gap=gap)
     for _ in range(round(SECONDS / DT) + 1):
-        dyn.step(
-            q,
-            qd,
-            None,
-            DT,
-            target_q=target,
-            options=spo.StepOptions(passes=passes),
-            report=spo.StepReport(contact_gap=gap),
-            status=status,
-            out=out,
-        )
+        dyn.step(q, qd, None, DT, target_q=target, status=status, out=out, options=options, report=report)
         energy = energies(torch, dyn, values, target, q, qd, gap)
         if before is None:
             start = energy

@@ -80,15 +80,8 @@ def words_of_bad_values(scene, q, name, device, **options):
     found = np.full((3, 4), -1, np.int32)
     dyn.forward_dynamics(q, rates, rates, status=found[0])
     for word, count in zip(found[1:], (1, 3), strict=True):
-        dyn.step(
-            q,
-            rates,
-            rates,
-            1e-3,
-            options=spo.StepOptions(substeps=count),
-            ctrl=np.zeros((4, len(scene.actuators))),
-            status=word,
-        )
+        ctrl, options = np.zeros((4, len(scene.actuators))), spo.StepOptions(substeps=count)
+        dyn.step(q, rates, rates, 1e-3, ctrl=ctrl, options=options, status=word)
     return found
 
 

@@ -106,14 +106,8 @@ def test_limbs_of_a_gpu_and_a_thread_of_a_cpu_agree(passes, device):
         dyn = spo.Dynamics(scene, count, on, "float64", variable=("contact_friction",))
         given = {n: wp.array(x[:count], dtype=wp.float64, device=on) if np.ndim(x) else x for n, x in a.items()}
         given["qdd"] = wp.zeros_like(given["qd"])
-        dyn.step(
-            given["q"],
-            given["qd"],
-            given["tau"],
-            H,
-            report=spo.StepReport(qdd=given["qdd"]),
-            options=spo.StepOptions(passes=passes),
-        )
+        more = dict(report=spo.StepReport(qdd=given["qdd"]), options=spo.StepOptions(passes=passes))
+        dyn.step(given["q"], given["qd"], given["tau"], H, **more)
         outs = [wp.full(dyn._gradients.shape_of(STEP, n), np.nan, dtype=wp.float64, device=on) for n in WRT]
         dyn._gradients.launch(derivative_of(STEP), WRT, outs, given)
         found.append([out.numpy() for out in outs])

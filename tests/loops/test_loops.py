@@ -15,7 +15,7 @@ from support.closed_loops import (
     by_embedding,
     by_multipliers,
     lagrange,
-    traced,
+    run_embedded,
 )
 from support.mechanisms import MECHANISMS, Closed
 from support.quick import slow_unless
@@ -43,13 +43,10 @@ def test_minimal_coordinates_equal_lagrange(name):
     b = np.random.default_rng(2).normal(size=(3, size))
     arrays = {**s._asdict(), "b": b}
 
-    def run(operation, given, shape):
-        return traced(scene, f"embedded_{operation}", arrays, given, {"out": shape}, embedding=how)["out"]
-
-    Mass = run("mass_matrix", ("q",), (size, size))
-    inverse = run("mass_matrix_inverse", ("q",), (size, size))
-    solved = run("solve_mass_matrix", ("q", "b"), (size,))
-    tau = run("inverse_dynamics", ("q", "qd", "qdd", "body_f"), (size,))
+    Mass = run_embedded(scene, how, "mass_matrix", arrays, ("q",), (size, size))
+    inverse = run_embedded(scene, how, "mass_matrix_inverse", arrays, ("q",), (size, size))
+    solved = run_embedded(scene, how, "solve_mass_matrix", arrays, ("q", "b"), (size,))
+    tau = run_embedded(scene, how, "inverse_dynamics", arrays, ("q", "qd", "qdd", "body_f"), (size,))
     for w, c in enumerate(closed):
         right = c.mass_matrix(how.dofs)
         assert laws.error(Mass[w], right) <= DIFFERENCES

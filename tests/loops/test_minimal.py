@@ -7,7 +7,7 @@ import warp as wp
 import warp_spo as spo
 from support import laws, mechanisms, symbolic, zoo
 from support.allocations import no_warp_allocation
-from support.closed_loops import traced
+from support.closed_loops import run_embedded, traced
 from support.mechanisms import MECHANISMS, Closed
 from warp_spo.dynamics import inertia
 from warp_spo.dynamics.loop_analysis import ClosureEvaluator, embedding
@@ -80,15 +80,7 @@ def traced_error(name, operation):
     scene, how, s, closed = mechanisms.case(name)
     takes, shape, reference = CLOSED[operation]
     options = {"frames": where(scene)} if "jacobian" in operation[:9] or "operational" in operation else {}
-    got = traced(
-        scene,
-        f"embedded_{operation}",
-        arrays_of(s),
-        ("q", *takes),
-        {"out": shape(len(how.dofs))},
-        embedding=how,
-        **options,
-    )["out"]
+    got = run_embedded(scene, how, operation, arrays_of(s), ("q", *takes), shape(len(how.dofs)), **options)
     states = [{key: array[w] for key, array in arrays_of(s).items()} for w in range(3)]
     return max(laws.error(got[w], np.asarray(reference(c, states[w], how.dofs))) for w, c in enumerate(closed))
 
@@ -103,15 +95,8 @@ def test_a_tight_loop_holds_the_frames_it_ties():
     """The tip of a welded four-bar stands still, whatever pushes: its rows vanish; the crank's do not."""
     scene, how, s, _ = mechanisms.case("tilted, a weld")
     tip = (scene.body_count - 1, scene.loops[0].child_pose[:3])
-    got = traced(
-        scene,
-        "embedded_operational_inertia_inverse",
-        s._asdict(),
-        ("q",),
-        {"out": (12, 12)},
-        embedding=how,
-        frames=((0, (0.3, 0.1, 0.2)), tip),
-    )["out"]
+    frames = (0, (0.3, 0.1, 0.2)), tip
+    got = run_embedded(scene, how, "operational_inertia_inverse", s._asdict(), ("q",), (12, 12), frames=frames)
     assert np.abs(got[:, 6:]).max() <= 1e-10 * np.abs(got).max()
 
 
@@ -125,16 +110,8 @@ def test_dead_points_pass():
     worst = int(np.argmin(np.abs(X[:, 2])))
     assert np.abs(X[worst, 2]) < 1e-2
     s = mechanisms.states(scene, 1, q=q[[worst]])
-    got = traced(
-        scene,
-        "embedded_operational_inertia_inverse",
-        s._asdict(),
-        ("q",),
-        {"out": (18, 18)},
-        embedding=how,
-        frames=where(scene),
-    )["out"][0]
-    assert laws.error(got, Closed(scene, s.q[0]).operational_inertia_inverse(frames_of(scene))) <= DIFFERENCES
+    got = run_embedded(scene, how, "operational_inertia_inverse", s._asdict(), ("q",), (18, 18), frames=where(scene))
+    assert laws.error(got[0], Closed(scene, s.q[0]).operational_inertia_inverse(frames_of(scene))) <= DIFFERENCES
 
 
 def hybrid_error(name, held):
@@ -143,15 +120,8 @@ def hybrid_error(name, held):
     mask = np.zeros(scene.dof_count, dtype=bool)
     mask[np.array(how.dofs)[held]] = True
     shapes = {name: (scene.dof_count,) for name in ("out", "tau_out")}
-    got = traced(
-        scene,
-        "embedded_hybrid_dynamics",
-        s._asdict(),
-        ("q", "qd", "tau", "qdd", "body_f"),
-        shapes,
-        embedding=how,
-        mask=tuple(mask.tolist()),
-    )
+    given, held_dofs = ("q", "qd", "tau", "qdd", "body_f"), tuple(mask.tolist())
+    got = traced(scene, "embedded_hybrid_dynamics", s._asdict(), given, shapes, embedding=how, mask=held_dofs)
     errors = []
     for w, c in enumerate(closed):
         right = c.hybrid_dynamics(s.qd[w], s.tau[w], s.qdd[w], mask, how.dofs, s.body_f[w])
@@ -243,23 +213,9 @@ def test_a_planted_bug_in_the_columns_is_seen(monkeypatch):
     symbolic.plant(monkeypatch, minimal, "solve_mass_matrix", "place[dof], *column)", first)
     scene, how, s, _ = mechanisms.case("fivebar")
     b = np.random.default_rng(0).normal(size=(3, len(how.dofs), 2))
-    both = traced(
-        scene,
-        "embedded_solve_mass_matrix",
-        {**s._asdict(), "b": b},
-        ("q", "b"),
-        {"out": b.shape[1:]},
-        embedding=how,
-        columns=2,
-    )["out"]
-    second = traced(
-        scene,
-        "embedded_solve_mass_matrix",
-        {**s._asdict(), "b": b[:, :, 1]},
-        ("q", "b"),
-        {"out": b.shape[1:2]},
-        embedding=how,
-    )["out"]
+    solve, arrays = (scene, how, "solve_mass_matrix"), s._asdict()
+    both = run_embedded(*solve, arrays | {"b": b}, ("q", "b"), b.shape[1:], columns=2)
+    second = run_embedded(*solve, arrays | {"b": b[:, :, 1]}, ("q", "b"), b.shape[1:2])
     assert laws.error(both[:, :, 1], second) > 0.1
 
 

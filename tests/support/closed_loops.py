@@ -30,10 +30,13 @@ def traced(scene, operation, arrays, given, shapes, dtype="float64", **options):
     return results
 
 
+def run_embedded(scene, how, operation, arrays, given, shape, dtype="float64", **options):
+    """The result "out" of an operation with loops embedded."""
+    return traced(scene, f"embedded_{operation}", arrays, given, {"out": shape}, dtype, embedding=how, **options)["out"]
+
+
 def by_embedding(scene, how, s, given=LOADED, dtype="float64"):
-    return traced(
-        scene, "embedded_forward_dynamics", s._asdict(), given, {"out": (scene.dof_count,)}, dtype, embedding=how
-    )["out"]
+    return run_embedded(scene, how, "forward_dynamics", s._asdict(), given, (scene.dof_count,), dtype)
 
 
 def by_multipliers(scene, s, given=LOADED):
