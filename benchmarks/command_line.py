@@ -6,9 +6,7 @@ import argparse
 from pathlib import Path
 
 
-def parser(
-    name: str, doc: str | None, device: bool = True, json: str = "file for the results"
-) -> argparse.ArgumentParser:
+def parser(name: str, doc: str | None, device: bool = True, json: str = "a file for rows") -> argparse.ArgumentParser:
     """Return the parser of ``python -m benchmarks.NAME`` with --json, and --device if ``device``.
 
     Args:

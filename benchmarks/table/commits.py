@@ -111,10 +111,7 @@ def measure(root: Path, chosen: Sequence[dict], device: str | None) -> list[dict
         for scene in {case["scene"] for case in chosen}:
             files[scene] = folder / f"{scene}.urdf"
             files[scene].write_text(robots.urdf_text(scene))
-        given = [
-            case | dict(urdf=str(files[case["scene"]]), floating=robots.ROBOTS[case["scene"]].floating)
-            for case in chosen
-        ]
+        given = [x | dict(urdf=str(files[x["scene"]]), floating=robots.ROBOTS[x["scene"]].floating) for x in chosen]
         (folder / "cases.json").write_text(json.dumps(given))
         shutil.copy(probe.__file__, folder / "probe.py")  # beside nothing that could hide a module of the same name
         path = os.pathsep.join([str(root), *filter(None, [os.environ.get("PYTHONPATH")])])

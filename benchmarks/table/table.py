@@ -162,9 +162,7 @@ def beyond(evidence: Evidence) -> str:
     text.append("|---|" + "---:|" * len(counts))
     for group, name in dict.fromkeys((row["group"], row["name"]) for row in rows):
         mine = {row["worlds"]: row for row in rows if (row["group"], row["name"]) == (group, name)}
-        text.append(
-            f"| {GROUPS.get(group, group)}: {name} | " + " | ".join(time(mine.get(worlds)) for worlds in counts) + " |"
-        )
+        text.append(f"| {GROUPS.get(group, group)}: {name} | " + " | ".join(time(mine.get(n)) for n in counts) + " |")
     return "\n".join(text) + "\n"
 
 

@@ -16,10 +16,7 @@ from support.laws import OPERATIONS, TOLERANCE, numbers
 from warp_spo.dynamics.dynamics import OPERATIONS as DECLARED
 
 INPUTS = [
-    (operation, name)
-    for operation, (takes, _) in OPERATIONS.items()
-    for name in ("q", *takes)
-    if name not in ("frames", "dt")
+    (operation, x) for operation, (takes, _) in OPERATIONS.items() for x in ("q", *takes) if x not in ("frames", "dt")
 ]
 
 

@@ -56,10 +56,7 @@ def test_other_worlds_keep_their_values(granularity, device):
         dyn.set(**start)
         mask = mask_of(kind, dyn)
         dyn.set(worlds=mask, **{name: made(kind, value, dyn) for name, value in new.items()})
-        chosen = {
-            name: np.where(MASK.reshape((-1,) + (1,) * (start[name].ndim - 1)), new[name], start[name])
-            for name in NAMES
-        }
+        chosen = {n: np.where(MASK.reshape((-1,) + (1,) * (start[n].ndim - 1)), new[n], start[n]) for n in NAMES}
         mass, force = dyn.mass_matrix(a["q"]), dyn.passive_force(a["q"], a["qd"])
         for w in range(WORLDS):
             dense = Dense(scene().with_values(**{name: value[w] for name, value in chosen.items()}), a["q"][w])

@@ -66,9 +66,7 @@ def cage(dtype, device, count):
         half = [0.2, 0.2, 0.2]
         half[axis] = 0.02
         walls.append(dict(box=(half, (*place, 0, 0, 0, 1))))
-    contacts = [
-        spo.Contact(1, sphere=0.05, other=spo.Contact(0, **wall), stiffness=1e5, damping=10.0) for wall in walls
-    ]
+    contacts = [spo.Contact(1, sphere=0.05, other=spo.Contact(0, **wall), stiffness=1e5, damping=10) for wall in walls]
     scene = free([cube(2.0, 0.2), cube(1.0, 0.05)], contacts)
     q, qd = np.zeros((1, 14), dtype), np.zeros((1, 12), dtype)
     q[:, [6, 13]], qd[0, 6:9] = 1.0, [2.0, 1.3, 0.7]

@@ -65,10 +65,7 @@ def test_float64_has_room_for_as_many_scalars_as_float32(kilobytes, room, monkey
     """Where the GPU has the memory; a block asks for what it may not declare."""
     facts = dataclasses.replace(MEASURED, shared_bytes=kilobytes * 1024)
     monkeypatch.setattr("warp_spo.dynamics.dynamics.read_facts", lambda device: facts)
-    rooms = {
-        dtype: spo.Dynamics(zoo.star(2), 2, "cpu", dtype=dtype).programs.builder.room()
-        for dtype in ("float32", "float64")
-    }
+    rooms = {x: spo.Dynamics(zoo.star(2), 2, "cpu", dtype=x).programs.builder.room() for x in ("float32", "float64")}
     assert rooms == {"float32": 46 * 1024, "float64": room * 1024}
 
 

@@ -74,9 +74,7 @@ BASE = {"mass_matrix": 1.2e-7, "gravity_force": 2e-7}  # two and three roundings
 def test_float32_of_a_free_base_is_better_than_its_rotation(operation, granularity, device):
     """A rotation in float32 is off by up to 6e-7 from its inverse, R m R* from m; in each of 500 states."""
     scene, worlds = ROBOTS["ant"](), 500
-    rounded, exact = (
-        spo.Dynamics(scene, worlds, device=device, dtype=dtype, granularity=granularity) for dtype in DTYPES
-    )
+    rounded, exact = (spo.Dynamics(scene, worlds, device=device, dtype=x, granularity=granularity) for x in DTYPES)
     arrays = laws.states(scene, worlds, dtype="float32")
     got, wanted = (laws.numpy_call(dyn, operation, arrays).reshape(worlds, -1) for dyn in (rounded, exact))
     error = np.linalg.norm(got - wanted, axis=1) / np.linalg.norm(wanted, axis=1)

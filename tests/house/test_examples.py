@@ -118,9 +118,7 @@ def test_gradients_through_500_steps_bring_hands_to_targets(tmp_path):
     assert (tmp_path / "reach.png").stat().st_size > 10_000  # pictures need not be SVG
 
 
-@pytest.mark.parametrize(
-    "name", sorted(path.stem for path in FOLDER.glob("[a-z]*.py") if path.stem not in ("parts", "options"))
-)
+@pytest.mark.parametrize("name", sorted(x.stem for x in FOLDER.glob("[a-z]*.py") if x.stem not in ("parts", "options")))
 def test_help_is_the_docstring_and_the_arguments(name, monkeypatch, capsys):
     module = importlib.import_module(f"warp_spo.examples.{name}")
     monkeypatch.setattr(sys, "argv", [name, "--help"])

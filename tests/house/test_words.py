@@ -99,9 +99,7 @@ def test_private_words_stay_away():
         if path.stem in MODULES:
             found.append(f"{path.name}: the module is called {MODULES[path.stem]}")
         if not waits(path):
-            found += [
-                f"{path.name}:{line} {name}: {banned[name]}" for name, line in names_defined_in(path) if name in banned
-            ]
+            found += [f"{path.name}:{line} {x}: {banned[x]}" for x, line in names_defined_in(path) if x in banned]
     assert not found, "\n".join(found)
 
 

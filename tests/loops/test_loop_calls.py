@@ -132,8 +132,7 @@ def test_variable_values_are_read(device):
     names = ("body_mass", "joint_X_p")
     for loops in ("embed", "multipliers"):
         folded, free = (
-            spo.Dynamics(scene, 3, device=device, dtype="float64", loops=loops, variable=variable)
-            for variable in ((), names)
+            spo.Dynamics(scene, 3, device=device, dtype="float64", loops=loops, variable=x) for x in ((), names)
         )
         free.set(body_mass=2.0 * scene.values["body_mass"][0])
         free.set(**{name: scene.values[name][0] for name in names})

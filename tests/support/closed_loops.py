@@ -64,7 +64,4 @@ def flat(angles):
 
 
 def both(scene, worlds, device, dtype="float64", **more):
-    return [
-        spo.Dynamics(scene, worlds, device=device, dtype=dtype, loops=loops, **more)
-        for loops in ("embed", "multipliers")
-    ]
+    return [spo.Dynamics(scene, worlds, device=device, dtype=dtype, loops=x, **more) for x in ("embed", "multipliers")]

@@ -88,10 +88,7 @@ def run(text, arrays, backwards=False, further=None, over=None):
     frame, over = text.frame, over or {}
     worlds = len(next(array for name, array in arrays.items() if name not in (*frame.fields, *frame.numbers)))
     rows = {f"{row.name}_row": Shared(row.name, arrays[row.name].reshape(worlds, -1).T) for row in frame.rows}
-    rows |= {
-        f"{row.name}_row": rows[f"{over[row.name]}_row"] if row.name in over else Shared(row.name)
-        for row in frame.further
-    }
+    rows |= {f"{x.name}_row": rows[f"{over[x.name]}_row"] if x.name in over else Shared(x.name) for x in frame.further}
     result = rows[f"{frame.result.row}_row"] if frame.result.way == IN_PLACE else Shared("result")
     result, sent = rows[f"{over['out']}_row"] if "out" in over else result, Shared("sent")
     fields = {name: arrays[name] for name in frame.fields}

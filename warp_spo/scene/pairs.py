@@ -87,9 +87,7 @@ def pair_values(pair: ContactPair, scene: Any, neutral: Any) -> tuple[float, flo
         if any(scene.hinges[scene.hinge_of[one]].dof_count for one in way):
             carried = [other for other in range(len(parents)) if not together or scene.tree.is_ancestor(body, other)]
             carried += [body] if together else []
-            masses.append(
-                sum(neutral.masses[other] for other in set(carried) if neutral.roots[other] == neutral.roots[body])
-            )
+            masses.append(sum(neutral.masses[i] for i in set(carried) if neutral.roots[i] == neutral.roots[body]))
     mass = float(min(masses, default=0.0)) or 1.0
     k = mass * neutral.gravity / STATIC_SINK if contact.stiffness is None else contact.stiffness
     d = DAMPING * np.sqrt(k * mass) if contact.damping is None else contact.damping

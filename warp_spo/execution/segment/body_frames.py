@@ -54,12 +54,7 @@ def is_supported(links: Links) -> bool:
         name not in links.variable and (links.scene.values[name] == links.scene.values[name][:1]).all()
         for name in ("joint_X_p", "joint_X_c")
     )
-    if (
-        not fixed
-        or links.shares_dofs
-        or links.flexible
-        or any(placement.link is None for placement in links.placements.values())
-    ):
+    if not fixed or links.shares_dofs or links.flexible or any(one.link is None for one in links.placements.values()):
         return False
     anchored = all(node.anchor == (IDENTITY, ZERO) for node in links.nodes.values())
     return anchored or all(is_constant(x) for node in links.nodes.values() for x in node.com)

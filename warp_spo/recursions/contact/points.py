@@ -154,9 +154,7 @@ def place_points(
     half_way, still = KICK in trace.inputs, (ZERO, ZERO)
     path = trace.vector(PATH) if half_way else qd
     place_of_ground = ground_offset(joint_laws)
-    seats = {
-        number: _contact_placement(trace, number, body, at) for number, body, at in _point_positions(trace, joint_laws)
-    }
+    seats = {at: _contact_placement(trace, at, body, place) for at, body, place in _point_positions(trace, joint_laws)}
     needed = with_ancestors([link for link, _ in seats.values()] if carry is None else point_links(trace.links))
     asked = directions(ground)
     count = len(asked)

@@ -173,9 +173,7 @@ class PassAdjoint(OnePass):
             seeds += [trace.vector("q_cotangent")(link.coordinate + c) for c in range(len(values))]
         seeds = [select(self.last, seed, 0.0) for seed in seeds]
         results += [item.value for item in self.pass_variables.stores]
-        return results, seeds + [
-            self._of_later(COTANGENT, self._dofs + item.index[0]) for item in self.pass_variables.stores
-        ]
+        return results, seeds + [self._of_later(COTANGENT, self._dofs + x.index[0]) for x in self.pass_variables.stores]
 
     @property
     def _dofs(self) -> int:

@@ -134,9 +134,7 @@ class OnePass(ContactStepTrace):
         after = (GAIN, *(item.array for item in self.pass_variables.stores))
         sent += [item for item in found.sweep if item.array not in after]
         gains = [
-            Store("out", (dofs[item.index[0]],), item.value * reciprocal(self.h))
-            for item in found.sweep
-            if item.array == GAIN
+            Store("out", (dofs[x.index[0]],), x.value * reciprocal(self.h)) for x in found.sweep if x.array == GAIN
         ]
         return sent + gains + self.pass_variables.stores
 

@@ -64,9 +64,7 @@ def inverse_dynamics_derivatives(trace: Trace, mass: bool = True) -> list[Store]
         for arm, pull, torque in _wrenches(trace, link):
             all_in = all_in + sensitivity.under_load(arm, pull, torque)
             n, f = n - torque - cross(arm, pull), f - pull
-        for parts in zip(
-            *(trace.exchange.from_children(link, letter, inner[letter], list) for letter in letters), strict=True
-        ):
+        for parts in zip(*(trace.exchange.from_children(link, x, inner[x], list) for x in letters), strict=True):
             values = dict(zip(letters, parts, strict=True))
             all_in = all_in + CarriedSums.unpacked(values)
             n, f = n + Vector(values["f"][:3]), f + Vector(values["f"][3:])

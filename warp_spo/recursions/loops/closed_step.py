@@ -93,9 +93,7 @@ class ClosedStep(Step):
 
     def _rank_loss(self) -> Value:
         least = RESOLVED * self.trace.epsilon
-        before, after = (
-            total(1.0 - less(least, margin) for margin in margins) for margins in (self.margins, self.margins_after)
-        )
+        before, after = (total(1.0 - less(least, x) for x in margins) for margins in (self.margins, self.margins_after))
         return before + select(all_finite(self.rates), after, 0.0)
 
     def _constraint_error(self) -> Value:

@@ -146,9 +146,7 @@ def inverse_dynamics_jvp(trace: Trace, embedding: Embedding) -> list[Store]:
     trace.inputs = ("q",)  # at rest, without loads: Mass times the change
     for item in newton_euler.inverse_dynamics(trace, gravity=False, qdd=change.__getitem__):
         rates[item.index[0]] = rates[item.index[0]] + item.value
-    return [
-        Store("out", (i,), total(x * rates[dof] for dof, x in X[free].items())) for i, free in enumerate(embedding.dofs)
-    ]
+    return [Store("out", (i,), total(x * rates[k] for k, x in X[dof].items())) for i, dof in enumerate(embedding.dofs)]
 
 
 def _rates_at_fixed_accelerations(

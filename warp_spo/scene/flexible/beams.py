@@ -276,9 +276,7 @@ def _stiffness(
     curvatures = [curves.values(x, 2 if i < 2 else 1) for i, curves in enumerate(shapes.curves)]
     E, G = material.E, float(material.G)  # type: ignore[arg-type]
     rigidities = (E * section.Iz, E * section.Iy, G * section.torsion, E * section.area)  # type: ignore[operator]
-    return np.concatenate(
-        [rigidity * weights @ curvature**2 for rigidity, curvature in zip(rigidities, curvatures, strict=True)]
-    )
+    return np.concatenate([rigidity * weights @ bend**2 for rigidity, bend in zip(rigidities, curvatures, strict=True)])
 
 
 def _counts(count: Any, ends: str) -> dict[str, int]:
