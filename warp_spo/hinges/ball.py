@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from ..trace.scalars import Value, is_constant, reciprocal, sqrt
-from ..trace.spatial import ZERO, Matrix, Pose, Vector, cross, dot
-from .hinge_type import BALL, Carrier, Entry, HingeType, LinkPlacement, Twist
+from ..trace.spatial import ZERO, Matrix, Pose, Twist, Vector, cross, dot
+from .hinge_type import BALL, Carrier, Entry, HingeType, LinkPlacement
 from .quaternions import Quaternion, multiply, quaternion_rotation, rotate_by, rotation_vector
 
 

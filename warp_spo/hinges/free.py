@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ..trace.scalars import Value
-from ..trace.spatial import ZERO, Matrix, Vector, cross
+from ..trace.spatial import ZERO, Matrix, Twist, Vector, cross
 from .ball import Ball, hinge_rotation, inverse_hinge_rotation
-from .hinge_type import FREE, Carrier, Entry, LinkPlacement, Twist
+from .hinge_type import FREE, Carrier, Entry, LinkPlacement
 from .quaternions import quaternion_rotation
 
 

@@ -13,13 +13,12 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..trace.scalars import Value
-from ..trace.spatial import ZERO, Matrix, Pose, Rigid, Vector, cross
+from ..trace.spatial import ZERO, Matrix, Pose, Rigid, Twist, Vector, cross
 from .quaternions import Quaternion, constant_quaternion
 
 SCREWS, BALL, FREE = range(3)  # how work at node granularity places a node
 STILL = (ZERO, ZERO)
 Entry = Callable[[int], Value]
-Twist = tuple[Vector, Vector]  # (omega; v), (n; f), or (omega'; v')
 
 
 class Carrier(Protocol):

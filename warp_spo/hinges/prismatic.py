@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from ..trace.scalars import Value
-from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, symmetric
-from .hinge_type import SCREWS, Carrier, Entry, HingeType, LinkPlacement, Twist
+from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Twist, Vector, symmetric
+from .hinge_type import SCREWS, Carrier, Entry, HingeType, LinkPlacement
 from .quaternions import Quaternion
 
 Z = IDENTITY[2]

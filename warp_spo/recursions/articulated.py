@@ -14,7 +14,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..trace.scalars import Value, absolute, guarded, is_constant, quotient, reciprocal
-from ..trace.spatial import IDENTITY, ZERO, Articulated, Pose, Rigid, Vector, cross, dot, magnitude, symmetric, total
+from ..trace.spatial import (
+    IDENTITY,
+    ZERO,
+    Articulated,
+    Pose,
+    Rigid,
+    Twist,
+    Vector,
+    cross,
+    dot,
+    magnitude,
+    symmetric,
+    total,
+)
 from .model.links import Link, LinkPlacement
 from .motion import NONE, VelocityTerms, carry_acceleration, hinge_entries, hinge_motion
 
@@ -295,13 +308,8 @@ def force_on_parent(link: Link, place: LinkPlacement, done: LinkFactor, motion: 
 
 
 def expand_link(
-    link: Link,
-    place: LinkPlacement,
-    done: LinkFactor,
-    rates: list[Value],
-    motion: VelocityTerms,
-    acceleration: tuple[Vector, Vector],
-) -> tuple[list[Value], tuple[Vector, Vector]]:
+    link: Link, place: LinkPlacement, done: LinkFactor, rates: list[Value], motion: VelocityTerms, acceleration: Twist
+) -> tuple[list[Value], Twist]:
     """Return qdd of the link's dofs, and the link's acceleration (omega'; v') in its own axes.
 
     Args:
@@ -341,13 +349,8 @@ def _reduce_root(place: LinkPlacement, pivots: list[Pivot], force: Vector, tau: 
 
 
 def _expand_root(
-    link: Link,
-    place: LinkPlacement,
-    pivots: list[Pivot],
-    rates: list[Value],
-    motion: VelocityTerms,
-    base: tuple[Vector, Vector],
-) -> tuple[list[Value], tuple[Vector, Vector]]:
+    link: Link, place: LinkPlacement, pivots: list[Pivot], rates: list[Value], motion: VelocityTerms, base: Twist
+) -> tuple[list[Value], Twist]:
     """Return qdd of a root link's dofs and its acceleration, as :func:`expand_link`, for pivots in the hinge's axes.
 
     The acceleration is taken to the hinge's axes, where the columns of the pivots are unit vectors, and the result is

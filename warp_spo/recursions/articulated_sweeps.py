@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant
-from ..trace.spatial import ZERO, Articulated, Pose, Vector, total
+from ..trace.spatial import ZERO, Articulated, Pose, Twist, Vector, total
 from . import articulated
 from .articulated import HERE, NO_INERTIA
 from .model import shared_dofs
@@ -168,10 +168,10 @@ def expand(
     trace: Trace,
     done: Factors,
     rates: dict,
-    base: tuple[Vector, Vector],
+    base: Twist,
     letter: str = "a",
     name: str = "out",
-    alpha: dict[int, tuple[Vector, Vector]] | None = None,
+    alpha: dict[int, Twist] | None = None,
 ) -> list[Store]:
     """Sweep outward: return stores of qdd in the array ``name``, for ``rates`` of :func:`reduce`.
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from ..trace.emission import Store
 from ..trace.scalars import Value
-from ..trace.spatial import IDENTITY, ZERO, Pose, Rigid, Vector
+from ..trace.spatial import IDENTITY, ZERO, Pose, Rigid, Vector, Wrench
 from .articulated import columns
 from .articulated_sweeps import mirror, pack
 from .model.links import NOTHING as NOTHING
@@ -17,11 +17,8 @@ if TYPE_CHECKING:
     from .model.tracing import Trace
 
 
-Force = tuple[Vector, Vector]
-
-
 def entries(
-    link: Link, places: dict[int, LinkPlacement], body: Rigid, shared: dict[int, Force]
+    link: Link, places: dict[int, LinkPlacement], body: Rigid, shared: dict[int, Wrench]
 ) -> dict[tuple[int, int], Value]:
     """(row, column) of Mass for the columns of a link that carries ``body`` = R, rows on the way to the root.
 
@@ -79,7 +76,7 @@ def mass_matrix(trace: Trace) -> list[Store]:
     """out = Mass, both triangles"""
     carried: dict[int, Rigid] = {}
     found: dict[tuple[int, int], Value] = {}
-    shared: dict[int, Force] = {}
+    shared: dict[int, Wrench] = {}
     stores: list[Store] = []
     for link, outward in trace.traversal():
         if outward:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant, select
-from ..trace.spatial import Articulated, Pose, Vector, dot, total
+from ..trace.spatial import Articulated, Pose, Twist, Vector, dot, total
 from . import articulated, newton_euler
 from .articulated import LEAST, NO_INERTIA, LinkFactor, Pivot
 from .articulated_sweeps import NO_FORCE, Factors, inside, total_inertia
@@ -97,9 +97,9 @@ def expand_link(
     rates: list[Value],
     forces_at_rest: list[Value],
     motion: VelocityTerms,
-    acceleration: tuple[Vector, Vector],
+    acceleration: Twist,
     given: Given,
-) -> tuple[list[Value], list[Value], tuple[Vector, Vector]]:
+) -> tuple[list[Value], list[Value], Twist]:
     """qdd and tau of the link's dofs and its acceleration, for the ``acceleration`` of its parent."""
     w, v = carry_acceleration(place, motion, acceleration)
     alpha = Vector((*(w + motion.bias_w), *(v + motion.bias_v)))
@@ -196,7 +196,7 @@ class HybridSweeps:
         )
         self.rates[id(leader)], self.forces_at_rest[id(leader)], self.forces[key] = found
 
-    def expand(self, link: Link, above: tuple[Vector, Vector]) -> tuple[tuple[Vector, Vector], list[Store]]:
+    def expand(self, link: Link, above: Twist) -> tuple[Twist, list[Store]]:
         """Return the acceleration of a link for that of its parent, and the stores of its qdd and tau."""
         trace, key = self.trace, id(link)
         known, place, move = self.given[key], trace.places[key], trace.motions[key]
@@ -212,7 +212,7 @@ class HybridSweeps:
             )
         return alpha, _stores(link, qdd, tau)
 
-    def _expand_group(self, leader: Link, above: tuple[Vector, Vector]) -> list[Store]:
+    def _expand_group(self, leader: Link, above: Twist) -> list[Store]:
         """Return the stores of a group's qdd and tau."""
         key, known = id(leader), self.given[id(leader)]
         qdd, row_forces = shared_dofs.expand(self.done[key], self.rates[key], above)
@@ -242,7 +242,7 @@ def hybrid_dynamics(trace: Trace, mask: tuple[bool, ...] | None = None) -> list[
             trace.place(link, moves)
         else:
             sweeps.reduce(link)
-    alpha: dict[int, tuple[Vector, Vector]] = {}
+    alpha: dict[int, Twist] = {}
     stores: list[Store] = []
     for link in trace.links.links:
         trace.label(link, "a")

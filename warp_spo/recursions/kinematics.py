@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from ..hinges.quaternions import Quaternion, constant_quaternion, multiply, turned
 from ..trace.emission import Store
 from ..trace.scalars import Value, constant_of
-from ..trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, dot
+from ..trace.spatial import IDENTITY, ZERO, Matrix, Twist, Vector, cross, dot
 from .model.links import Link, LinkPlacement, Links, place_link
 from .motion import hinge_motion
 from .newton_euler import link_acceleration
@@ -24,7 +24,7 @@ def relative_quaternion(link: Link, q: Any) -> Quaternion:
     return link.hinge.relative_quaternion(link, q)
 
 
-def carried_velocity(place: LinkPlacement, parent: tuple[Vector, Vector], hinge: tuple) -> tuple[Vector, Vector]:
+def carried_velocity(place: LinkPlacement, parent: Twist, hinge: tuple) -> Twist:
     """(omega; v) of the link's frame, in its axes, for its parent's and the hinge's own."""
     w, v = place.pose.motion_to_child(*parent)
     return w + hinge[0], v + hinge[1]
@@ -35,9 +35,7 @@ def velocity(axes: Matrix, w: Any, v: Any, arm: Any) -> Vector:
     return axes @ (v + cross(w, arm))
 
 
-def columns(
-    link: Link, place: LinkPlacement, parent_axes: Matrix, axes: Matrix, arm: Vector
-) -> list[tuple[Vector, Vector]]:
+def columns(link: Link, place: LinkPlacement, parent_axes: Matrix, axes: Matrix, arm: Vector) -> list[Twist]:
     """Return (omega; v), in inertial axes, of a point at ``arm`` from the link's origin, per unit rate of each dof.
 
     ``axes`` are the link's, ``parent_axes`` the parent link's axes in the inertial frame, ``arm`` is in the link's.
@@ -160,9 +158,9 @@ def frame_poses(trace: Trace, frames: tuple) -> list[Store]:
     return stores
 
 
-def link_velocities(trace: Trace) -> dict[int | None, tuple[Vector, Vector]]:
+def link_velocities(trace: Trace) -> dict[int | None, Twist]:
     """Place every link, and return its (omega; v) in its axes, by id; None is the inertial frame."""
-    velocities: dict[int | None, tuple[Vector, Vector]] = {None: (ZERO, ZERO)}
+    velocities: dict[int | None, Twist] = {None: (ZERO, ZERO)}
     for link in trace.active_links:
         place_axes(trace, link)
         trace.label(link, "v")
@@ -222,9 +220,9 @@ def place_all(trace: Trace, moves: bool = False) -> dict[int, Vector]:
     return origins
 
 
-def link_accelerations(trace: Trace, qdd: Callable[[int], Value]) -> dict[int, tuple[Vector, Vector]]:
+def link_accelerations(trace: Trace, qdd: Callable[[int], Value]) -> dict[int, Twist]:
     """Return the accelerations of the links without gravity: phi* (H* qdd + a)."""
-    alpha: dict[int, tuple[Vector, Vector]] = {}
+    alpha: dict[int, Twist] = {}
     for link in trace.links.links:
         trace.label(link, "a")
         above = (ZERO, ZERO) if link.parent is None else alpha[id(link.parent)]
@@ -245,7 +243,7 @@ def frame_accelerations(trace: Trace, frames: tuple) -> list[Store]:
     return accelerations_of_frames(trace, frames, link_accelerations(trace, trace.vector("qdd")))
 
 
-def accelerations_of_frames(trace: Trace, frames: tuple, alpha: dict[int, tuple[Vector, Vector]]) -> list[Store]:
+def accelerations_of_frames(trace: Trace, frames: tuple, alpha: dict[int, Twist]) -> list[Store]:
     """out [frame, 6]: accelerations of frames for those of their links ``alpha``, inertial axes"""
     stores = []
     for index, (body, origin) in enumerate(frames):

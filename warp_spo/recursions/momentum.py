@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from ..trace.emission import Store, merge
 from ..trace.scalars import Value, reciprocal
-from ..trace.spatial import ZERO, Rigid, Vector, cross
+from ..trace.spatial import ZERO, Rigid, Vector, Wrench, cross
 from . import articulated, composite, newton_euler
 from .kinematics import link_accelerations, link_velocities, place_all, zero
 from .model.links import Link
@@ -42,7 +42,7 @@ def center_of_mass(trace: Trace, bodies: dict[int, Rigid], origins: dict[int, Ve
     return inverse, moment * inverse
 
 
-def momenta(trace: Trace, link: Link, body: Rigid) -> list[tuple[Vector, Vector]]:
+def momenta(trace: Trace, link: Link, body: Rigid) -> list[Wrench]:
     """Return (n; f) = R(k) H* of each dof of a link, inertial axes, about the link's origin."""
     R, found = trace.axes[id(link)], []
     for H in articulated.columns(link, trace.places[id(link)]):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from ..trace.scalars import Value
-from ..trace.spatial import ZERO, Matrix, Pose, Vector, cross, symmetric
+from ..trace.spatial import ZERO, Matrix, Pose, Twist, Vector, cross, symmetric
 from .model.links import Link, LinkPlacement
 
 NONE = Matrix.of([[0.0] * 3] * 3)
@@ -41,7 +41,7 @@ def whirl(w: Vector) -> Matrix:
     return symmetric(-(yy + zz), -(xx + zz), -(xx + yy), w[0] * w[1], w[0] * w[2], w[1] * w[2])
 
 
-def hinge_motion(link: Link, place: LinkPlacement, rate: Any) -> tuple[Vector, Vector]:
+def hinge_motion(link: Link, place: LinkPlacement, rate: Any) -> Twist:
     """Return H* rate, (omega; v) of the hinge in the link's axes, for ``rate(dof)``."""
     return link.hinge.velocity(place, [rate(dof) for dof in link.dofs])
 
@@ -51,7 +51,7 @@ def hinge_entries(link: Link, place: LinkPlacement, w: Vector, v: Vector) -> lis
     return link.hinge.forces(place, w, v)
 
 
-def own_bias(link: Link, place: LinkPlacement, qd: Any) -> tuple[Vector, Vector] | None:
+def own_bias(link: Link, place: LinkPlacement, qd: Any) -> Twist | None:
     """Return (d H* / dt) qd in the link's axes; None where H is constant in the link or in its parent."""
     return link.hinge.own_bias(place, [qd(dof) for dof in link.dofs])
 
@@ -72,9 +72,7 @@ def compose_motions(pose: Pose, parent: VelocityTerms, w: Vector, v: Vector) -> 
     return VelocityTerms(spin, whirl(spin), cross(carried, w), 2.0 * cross(carried, v), parent.whirl @ pose.l)
 
 
-def carry_acceleration(
-    place: LinkPlacement, motion: VelocityTerms, acceleration: tuple[Vector, Vector]
-) -> tuple[Vector, Vector]:
+def carry_acceleration(place: LinkPlacement, motion: VelocityTerms, acceleration: Twist) -> Twist:
     """Return the link's acceleration from that of its parent, without its own bias and qdd."""
     w, v = acceleration
     return place.pose.to_child(w), place.pose.to_child(v + cross(w, place.pose.l) + motion.bias_l)

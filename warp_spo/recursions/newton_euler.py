@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..trace.emission import Store
 from ..trace.scalars import Value
-from ..trace.spatial import IDENTITY, ZERO, Matrix, Rigid, Vector, cross, skew
+from ..trace.spatial import IDENTITY, ZERO, Matrix, Rigid, Twist, Vector, Wrench, cross, skew
 from .model.links import Link, LinkPlacement
 from .motion import VelocityTerms, armature_forces, carry_acceleration, hinge_entries, hinge_motion
 
@@ -15,9 +15,7 @@ if TYPE_CHECKING:
     from .model.tracing import Trace
 
 
-def link_acceleration(
-    link: Link, place: LinkPlacement, motion: VelocityTerms, acceleration: tuple[Vector, Vector], qdd: Any
-) -> tuple[Vector, Vector]:
+def link_acceleration(link: Link, place: LinkPlacement, motion: VelocityTerms, acceleration: Twist, qdd: Any) -> Twist:
     """Return the acceleration of the link for that of its parent and ``qdd(dof)``."""
     if link.hinge.unconstrained and link.parent is None:
         back = place.turned.T  # type: ignore[union-attr]
@@ -28,7 +26,7 @@ def link_acceleration(
     return w + motion.bias_w + w_j, v + motion.bias_v + v_j
 
 
-def root_acceleration(link: Link, base: tuple[Vector, Vector], qdd: Any) -> tuple[Vector, Vector]:
+def root_acceleration(link: Link, base: Twist, qdd: Any) -> Twist:
     """Return the acceleration of a free root link in the axes of its rates; ``base`` is that of the inertial frame."""
     back = (link.matrix or IDENTITY).T
     rates = [qdd(dof) for dof in link.dofs]
@@ -45,13 +43,13 @@ def body_force(inertia: Rigid, motion: VelocityTerms, w: Vector, v: Vector) -> V
 SEVERAL = 3  # wrenches on one link from which it takes fewer operations to add them up in inertial axes
 
 
-def wrench(axes: Matrix, com: Vector, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
+def wrench(axes: Matrix, com: Vector, force: Vector, torque: Vector) -> Wrench:
     """Return (n; f) about the frame's origin, in its ``axes``, for a force at ``com`` and a torque in inertial axes."""
     f, n = axes.T @ force, axes.T @ torque
     return n + cross(com, f), f
 
 
-def add_wrenches(axes: Matrix, acting: list[tuple[Vector, Vector, Vector]]) -> tuple[Vector, Vector]:
+def add_wrenches(axes: Matrix, acting: list[tuple[Vector, Vector, Vector]]) -> Wrench:
     """Return the sum of :func:`wrench` for several (com, force, torque).
 
     Of several bodies, the products com_i force_j in mixed axes are added up before they are turned: sum of com x R* f =
@@ -79,14 +77,7 @@ def hinge_force(link: Link, place: LinkPlacement, n: Vector, f: Vector, qdd: Any
 
 
 def root_force(
-    link: Link,
-    place: LinkPlacement,
-    n: Vector,
-    f: Vector,
-    mass: float,
-    v: Vector,
-    base: tuple[Vector, Vector],
-    qdd: Any,
+    link: Link, place: LinkPlacement, n: Vector, f: Vector, mass: float, v: Vector, base: Twist, qdd: Any
 ) -> list[Value]:
     """The same for a free link on the inertial frame that carries ``mass``, itself included, and accelerates with v.
 
@@ -103,7 +94,7 @@ def inverse_dynamics(
     """out = Mass qdd + bias_force, for ``qdd`` or the array of that name; without velocity terms if not ``moves``"""
     base = trace.base_acceleration if gravity else (ZERO, ZERO)
     qdd, moves = qdd or trace.vector("qdd"), moves and "qd" in trace.inputs
-    alpha: dict[int, tuple[Vector, Vector]] = {}
+    alpha: dict[int, Twist] = {}
     forces: dict[int, Vector] = {}
     shared: dict[int, Value] = {}  # of dofs that several links share
     stores = []

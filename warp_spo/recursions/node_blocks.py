@@ -22,7 +22,7 @@ from ..hinges.quaternions import matrix_quaternion
 from ..hinges.rotor_axis import RotorAxis
 from ..trace.emission import Store
 from ..trace.scalars import Value
-from ..trace.spatial import IDENTITY, ZERO, Pose, Rigid, Vector, cross, dot
+from ..trace.spatial import IDENTITY, ZERO, Pose, Rigid, Twist, Vector, cross, dot
 from .articulated import columns
 from .kinematics import place_all
 from .model.link import BodyPlacement, Link
@@ -197,11 +197,11 @@ def _inertia(trace: Trace, node: int) -> list[list[Value]]:
     return M
 
 
-def _in_link(placement: BodyPlacement, motion: Vector) -> tuple[Vector, Vector]:
+def _in_link(placement: BodyPlacement, motion: Vector) -> Twist:
     """Return a motion of a node frame as one of the frame of the link that it sits on."""
     w, v = placement.matrix @ Vector(motion[:3]), placement.matrix @ Vector(motion[3:])
     return w, v + cross(placement.offset, w)
 
 
-def _flat(twist: tuple[Vector, Vector]) -> Six:
+def _flat(twist: Twist) -> Six:
     return [*twist[0], *twist[1]]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from ..trace.emission import Store
 from ..trace.scalars import Value
-from ..trace.spatial import ZERO, Vector, cross
+from ..trace.spatial import ZERO, Twist, Vector, cross
 from . import articulated
 from .articulated_sweeps import NO_FORCE, factor_tree, mirror, pivots, propagate_inward, weighted_products
 from .kinematics import accelerations_of_frames, frame_on_link, place_all, place_axes
@@ -54,9 +54,7 @@ def operational_inertia_inverse_product(trace: Trace, frames: tuple) -> list[Sto
     return accelerations_of_frames(trace, frames, respond(trace, done, forces)[1])
 
 
-def respond(
-    trace: Trace, done: dict, forces: dict[int, Vector]
-) -> tuple[dict[int, Value], dict[int, tuple[Vector, Vector]]]:
+def respond(trace: Trace, done: dict, forces: dict[int, Vector]) -> tuple[dict[int, Value], dict[int, Twist]]:
     """Return what forces against the links, by id, make of the tree at rest: qdd by dof, accelerations of links by id.
 
     The sweep inward adds forces of children to ``forces``.
@@ -74,7 +72,7 @@ def respond(
         if link.parent is not None:
             forces[id(link.parent)] = forces[id(link.parent)] + force
     qdd: dict[int, Value] = {}
-    alpha: dict[int, tuple[Vector, Vector]] = {}
+    alpha: dict[int, Twist] = {}
     for link in trace.links.links:
         trace.label(link, "a")
         above = (ZERO, ZERO) if link.parent is None else alpha[id(link.parent)]

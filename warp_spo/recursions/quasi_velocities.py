@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from ..trace.differentiation import forward
 from ..trace.emission import Store
 from ..trace.scalars import Value, is_constant, ordered, sqrt
-from ..trace.spatial import ZERO, Articulated, Vector, dot, total
+from ..trace.spatial import ZERO, Articulated, Twist, Vector, dot, total
 from . import articulated, hybrid
 from .articulated_sweeps import Factors, eliminate
 from .derivatives.tangents import coordinate_directions
@@ -139,7 +139,7 @@ def _move(trace: Trace, qd: Entry) -> None:
         trace.motions[id(link)] = link_motion(link, trace.places[id(link)], parent, qd)
 
 
-def _accelerate(trace: Trace, done: Factors, tau: Entry, base: tuple[Vector, Vector]) -> dict[int, Value]:
+def _accelerate(trace: Trace, done: Factors, tau: Entry, base: Twist) -> dict[int, Value]:
     """Return sqrt(D) [I + H phi K]* qdd by dof, for the motions and external wrenches of the trace.
 
     As in forward dynamics, loads and velocity terms enter by bodies and not as forces of the hinges, which would lose
@@ -165,7 +165,7 @@ def _accelerate(trace: Trace, done: Factors, tau: Entry, base: tuple[Vector, Vec
             rate, z = articulated.reduce_pivot(pivot, z, tau(dof))
             rates[key].append(rate)
         forces[key] = articulated.force_on_parent(link, trace.places[key], done[key], move, z)
-    alpha: dict[int, tuple[Vector, Vector]] = {}  # accelerations at qdd = 0
+    alpha: dict[int, Twist] = {}  # accelerations at qdd = 0
     found: dict[int, Value] = {}
     for link in trace.links.links:
         trace.label(link, "a")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ..trace.emission import Store
-from ..trace.spatial import IDENTITY, Pose, Vector, cross
+from ..trace.spatial import IDENTITY, Pose, Twist, Vector, Wrench, cross
 from . import newton_euler
 from .kinematics import place_all
 from .motion import STILL
@@ -38,7 +38,7 @@ def body_reactions(trace: Trace) -> list[Store]:
     origins, alpha = _moving(trace)
     tree, placements, stores = trace.links.scene.tree, trace.links.placements, []
     still = -trace.places[id(trace.links.links[0])].pose.l  # the inertial frame's origin, seen from the first link's
-    forces: dict[int, tuple[Vector, Vector]] = {}
+    forces: dict[int, Wrench] = {}
     places: dict[int, Vector] = {}
     for body in reversed(list(placements)):  # parents come first there
         placement = placements[body]
@@ -65,11 +65,11 @@ def body_reactions(trace: Trace) -> list[Store]:
     return stores
 
 
-def _moving(trace: Trace) -> tuple[dict[int, Vector], dict[int, tuple[Vector, Vector]]]:
+def _moving(trace: Trace) -> tuple[dict[int, Vector], dict[int, Twist]]:
     """Return origins and accelerations of all links, with gravity as an acceleration of the base."""
     origins = place_all(trace, moves=True)
     qdd = trace.vector("qdd")
-    alpha: dict[int, tuple[Vector, Vector]] = {}
+    alpha: dict[int, Twist] = {}
     for link in trace.links.links:
         trace.label(link, "a")
         above = trace.base_acceleration if link.parent is None else alpha[id(link.parent)]

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..trace.emission import Store
 from ..trace.scalars import Value
-from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Vector, cross, dot, skew, symmetric
+from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Twist, Vector, cross, dot, skew, symmetric
 from .kinematics import carried_velocity
 from .model.links import Link
 from .motion import VelocityTerms, hinge_motion, whirl
@@ -25,7 +25,6 @@ from .newton_euler import body_force, hinge_entries, link_acceleration
 if TYPE_CHECKING:
     from .model.tracing import Trace
 
-Twist = tuple[Vector, Vector]
 COUNT = 10  # parameters of a body
 PRODUCTS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))  # entries of I, in the order of the parameters
 

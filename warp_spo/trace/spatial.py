@@ -46,6 +46,10 @@ class Vector(tuple):
         return all(is_constant(a) and a == 0.0 for a in self)
 
 
+Twist = tuple[Vector, Vector]  # (omega; v), or its rate of change
+Wrench = tuple[Vector, Vector]  # (n; f)
+
+
 ZERO = Vector((0.0, 0.0, 0.0))
 
 
@@ -116,7 +120,7 @@ class Rigid(NamedTuple):
     def __add__(self, other: Any) -> Rigid:
         return Rigid(self.mass + other.mass, self.moment + other.moment, self.inertia + other.inertia)
 
-    def apply(self, w: Vector, v: Vector) -> tuple[Vector, Vector]:
+    def apply(self, w: Vector, v: Vector) -> Wrench:
         """Return M (omega; v)."""
         return self.inertia @ w + cross(self.moment, v), self.mass * v - cross(self.moment, w)
 
@@ -148,7 +152,7 @@ class Articulated(NamedTuple):
     def __add__(self, other: Any) -> Articulated:
         return Articulated(self.J + other.J, self.C + other.C, self.m + other.m)
 
-    def apply(self, w: Vector, v: Vector) -> tuple[Vector, Vector]:
+    def apply(self, w: Vector, v: Vector) -> Wrench:
         """Return P (omega; v)."""
         return self.J @ w + self.C @ v, self.C.T @ w + self.m @ v
 
@@ -219,12 +223,12 @@ class Pose(NamedTuple):
         columns = [self.to_parent(axis) for axis in IDENTITY]
         return Matrix(columns).T
 
-    def force_to_parent(self, n: Vector, f: Vector) -> tuple[Vector, Vector]:
+    def force_to_parent(self, n: Vector, f: Vector) -> Wrench:
         """Return phi(p, k) (n; f)."""
         f = self.to_parent(f)
         return self.to_parent(n) + cross(self.l, f), f
 
-    def motion_to_child(self, w: Vector, v: Vector) -> tuple[Vector, Vector]:
+    def motion_to_child(self, w: Vector, v: Vector) -> Twist:
         """Return phi*(p, k) (omega; v)."""
         return self.to_child(w), self.to_child(v + cross(w, self.l))
 

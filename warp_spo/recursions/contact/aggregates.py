@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ...trace.emission import Store
 from ...trace.scalars import Value, branch, guarded, reciprocal
-from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Pose, Vector, cross, dot, total
+from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Pose, Twist, Vector, cross, dot, total
 from .. import articulated
 from ..articulated import NO_INERTIA
 from ..articulated_sweeps import NO_FORCE, Factors, StepTerms, eliminate
@@ -212,7 +212,7 @@ class Node:
         return Seat(over.turn.T @ own.turn, over.turn.T @ (own.at - over.at))
 
     # -- outward ---------------------------------------------------------------------------------------------------
-    def open(self, bare: dict[int, tuple[list[Value], tuple[Vector, Vector]]], above: tuple[Vector, Vector]) -> dict:
+    def open(self, bare: dict[int, tuple[list[Value], Twist]], above: Twist) -> dict:
         """Return rates of change of the dofs and acceleration of each link by id.
 
         Args:
@@ -226,7 +226,7 @@ class Node:
         by_link: dict[int, list[Value]] = {}
         for (name, _), x in zip(self.dofs, moved, strict=True):
             by_link.setdefault(name, []).append(x)
-        accelerations: dict[int | None, tuple[Vector, Vector]] = {key(self.aggregate.base): above}
+        accelerations: dict[int | None, Twist] = {key(self.aggregate.base): above}
         found: dict[int, list[Value]] = {}
         for link in self.aggregate.links:
             self.trace.label(link, "a")
@@ -306,12 +306,12 @@ def reduce(
 def expand(trace: Trace, plan: TiePlan, nodes: dict[int, Node], done: Factors, rates: dict, alpha: dict) -> list[Store]:
     """Sweep outward; ``alpha`` receives the accelerations of links. Return the stores of qdd."""
     stores: list[Store] = []
-    found: dict[int, tuple[list[Value], tuple[Vector, Vector]]] = {}
+    found: dict[int, tuple[list[Value], Twist]] = {}
     still = ZERO, ZERO
     for link in plan.order:
         at = id(link)
         if at in nodes:
-            bare: dict[int, tuple[list[Value], tuple[Vector, Vector]]] = {}
+            bare: dict[int, tuple[list[Value], Twist]] = {}
             for one in nodes[at].aggregate.links:
                 trace.label(one, "a")
                 over = key(one.parent)

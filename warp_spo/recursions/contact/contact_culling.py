@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from ...trace.scalars import Value, absolute, branch, is_constant, less, lost, select
-from ...trace.spatial import Articulated, Vector, total
+from ...trace.spatial import Articulated, Twist, Vector, total
 from .law import PointState, finish_point
 from .points import TracedContactPoint
 from .secant_laws import PassVariables, largest
@@ -41,7 +41,7 @@ class CullGroup(NamedTuple):
     reach: Value
     op: str
 
-    def may_touch(self, twist: tuple[Vector, Vector], h: Value) -> Value:
+    def may_touch(self, twist: Twist, h: Value) -> Value:
         """Return what is not zero where a pass that ends with this (omega; v) of the link may have a candidate."""
         w, v = (total(absolute(x) for x in part) for part in twist)
         beyond = self.highest + (MARGIN * h) * (v + self.reach * w)
@@ -54,7 +54,7 @@ class CullGroup(NamedTuple):
         return P.unpacked(found[: -len(push)]), Vector(found[-len(push) :])
 
     def finish(
-        self, pass_variables: PassVariables, moved: tuple[Vector, Vector], h: Value
+        self, pass_variables: PassVariables, moved: Twist, h: Value
     ) -> tuple[list[tuple[TracedContactPoint, Vector, Value]], list[Value]]:
         """Return the points with force and slip, and the largest excesses, and keep what the next pass reads.
 

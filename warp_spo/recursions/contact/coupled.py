@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from ...trace.emission import Store
 from ...trace.scalars import Value
-from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Vector, cross, total
+from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Twist, Vector, cross, total
 from .. import articulated
 from ..articulated_sweeps import Factors, StepTerms
 from ..model.links import Link, Links
@@ -64,7 +64,7 @@ class CoupledStep(ContactStepTrace):
         """Return factors and D^-1 eps of a pass by link, for forces of the dofs; no stores that send."""
         return *aggregates.reduce(self.trace, self.plan, self.nodes, terms, tau, self.phases), []
 
-    def outward(self, done: Factors, rates: dict, alpha: dict[int, tuple[Vector, Vector]]) -> list[Store]:
+    def outward(self, done: Factors, rates: dict, alpha: dict[int, Twist]) -> list[Store]:
         """Return the stores of qdd; ``alpha`` receives the accelerations of links by id."""
         return aggregates.expand(self.trace, self.plan, self.nodes, done, rates, alpha)
 
@@ -180,7 +180,7 @@ class CoupledStep(ContactStepTrace):
                 first = PLACES * pair + 12 * side
                 self.first += [Store(PLACE, (first + i,), value) for i, value in enumerate(values)]
 
-    def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, tuple[Vector, Vector]]) -> dict[int, Value]:
+    def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, Twist]) -> dict[int, Value]:
         """Leave the relative twists after the pass."""
         for number, couple in enumerate(self.couples):
             self.trace.label(couple.f, f"t{number}_")

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from ...trace.scalars import Value, inverse_root, less, select, sqrt
-from ...trace.spatial import ZERO, Vector, dot, total
+from ...trace.spatial import ZERO, Twist, Vector, dot, total
 from .points import TracedContactPoint
 
 TINY = 1e-24  # square of a slip [m^2/s^2] that is nothing; its derivative is still a number in float32
@@ -82,7 +82,7 @@ def force_at(point: TracedContactPoint, state: PointState, v: Vector, h: Value) 
 
 
 def finish_point(
-    point: TracedContactPoint, state: PointState, moved: tuple[Vector, Vector] | None, h: Value, closing: Value
+    point: TracedContactPoint, state: PointState, moved: Twist | None, h: Value, closing: Value
 ) -> PointResult:
     """Return what a pass finds of a point.
 

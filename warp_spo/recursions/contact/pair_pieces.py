@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Value, inverse_root
-from ...trace.spatial import Articulated, Matrix, Vector, cross, dot, total
+from ...trace.spatial import Articulated, Matrix, Twist, Vector, cross, dot, total
 from ..articulated import reduce_link
 from ..articulated_sweeps import NO_FORCE, StepTerms
 from ..kinematics import frame_on_link, velocity
@@ -247,7 +247,7 @@ class PairedSegment(ContactStepTrace):
         assert force is not None
         return rates, force
 
-    def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, tuple[Vector, Vector]]) -> dict[int, Value]:
+    def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, Twist]) -> dict[int, Value]:
         """Leave the bodies' twists after the pass."""
         for number, (link, arm) in self.seats.items():
             assert link is not None

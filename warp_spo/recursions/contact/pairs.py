@@ -15,7 +15,7 @@ import numpy as np
 from ...scene.scene import Scene
 from ...trace.emission import Store
 from ...trace.scalars import Value, sqrt
-from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, total
+from ...trace.spatial import IDENTITY, ZERO, Matrix, Twist, Vector, cross, total
 from ..articulated_sweeps import NO_FORCE, pivots, propagate_inward, weighted_products
 from ..kinematics import carried_velocity, frame_on_link, velocity
 from ..model import effective_mass
@@ -87,12 +87,10 @@ def place_axes_of(trace: Trace, links: list[Link | None]) -> None:
             trace.axes[id(link)] = turn if link.parent is None else trace.axes[id(link.parent)] @ turn
 
 
-def velocities_of(
-    trace: Trace, links: list[Link | None], qd: Callable[[int], Value]
-) -> dict[int | None, tuple[Vector, Vector]]:
+def velocities_of(trace: Trace, links: list[Link | None], qd: Callable[[int], Value]) -> dict[int | None, Twist]:
     """Return (omega; v) of links, and of those that carry them, in their axes by id."""
     needed = with_ancestors(links)
-    found: dict[int | None, tuple[Vector, Vector]] = {None: (ZERO, ZERO)}
+    found: dict[int | None, Twist] = {None: (ZERO, ZERO)}
     for link in trace.active_links:
         if id(link) in needed:
             trace.label(link, "v")
@@ -188,7 +186,7 @@ class PairedStep(ground.ContactStepTrace):
             prologue=found.prologue + self.first, sweep=self.response + found.sweep, epilogue=found.epilogue + reported
         )
 
-    def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, tuple[Vector, Vector]]) -> dict[int, Value]:
+    def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, Twist]) -> dict[int, Value]:
         """Return qd' - qd by dof with the forces between bodies; ``alpha`` becomes that of the links."""
         trace, bodies = self.trace, self.members.bodies
         frames = tuple((body, (0.0, 0.0, 0.0)) for body in bodies)

@@ -29,7 +29,7 @@ from ...scene.contacts import ContactPoint
 from ...scene.ground import AWAY, HEIGHTS, PLACE, HeightField, Listed
 from ...scene.scene import Scene
 from ...trace.scalars import Value, absolute, branch, is_constant, less, lost, reciprocal, select
-from ...trace.spatial import IDENTITY, ZERO, Vector, cross, dot, total
+from ...trace.spatial import IDENTITY, ZERO, Twist, Vector, cross, dot, total
 from ..kinematics import arm_on_link, carried_velocity, frame_on_link, zero
 from ..model import effective_mass
 from ..model.links import Link, Links
@@ -69,7 +69,7 @@ class TracedContactPoint:
     arm: Vector
     normal: Vector
     gap: Value
-    twist: tuple[Vector, Vector]
+    twist: Twist
     k: Value
     d: Value
     mu: Value
@@ -128,10 +128,10 @@ class ContactLinkMotion(NamedTuple):
 
     axes: list[Vector]
     origins: list[Value]
-    twist: tuple[Vector, Vector]
+    twist: Twist
     motion: VelocityTerms | None
-    bend: tuple[Vector, Vector]
-    travel: tuple[Vector, Vector]
+    bend: Twist
+    travel: Twist
 
 
 def place_points(

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from ...status import Status
 from ...trace.emission import Store
 from ...trace.scalars import Value, branch, is_constant, less, reciprocal, select
-from ...trace.spatial import ZERO, Articulated, Vector, dot, total
+from ...trace.spatial import ZERO, Articulated, Twist, Vector, dot, total
 from ..articulated_sweeps import Factors, StepTerms, expand, reduce
 from ..coordinates import integrate_link
 from ..kinematics import zero
@@ -88,7 +88,7 @@ class ContactStepTrace(Step):
         terms, tau = self._step_terms(points, states), trace.vector("tau")
         done, rates, sent = self.inward(terms, lambda dof: tau(dof) + self.forces[dof] - bias[dof])
         rates = self.close(done, rates)
-        alpha: dict[int, tuple[Vector, Vector]] = {}
+        alpha: dict[int, Twist] = {}
         moved = self.outward(done, rates, alpha)
         gains = {item.index[0]: self.h * item.value for item in moved if item.array == "out"}
         gains = self.couple(done, gains, alpha)
@@ -148,7 +148,7 @@ class ContactStepTrace(Step):
         """Return factors and D^-1 eps of a pass by link, for forces of the dofs, and the stores that send."""
         return reduce(self.trace, tau, moves=False, loads=False, phases=self.phases, terms=terms)
 
-    def outward(self, done: Factors, rates: dict, alpha: dict[int, tuple[Vector, Vector]]) -> list[Store]:
+    def outward(self, done: Factors, rates: dict, alpha: dict[int, Twist]) -> list[Store]:
         """Return the stores of qdd; ``alpha`` receives the accelerations of links by id."""
         return expand(self.trace, done, rates, (ZERO, ZERO), alpha=alpha)
 
@@ -157,7 +157,7 @@ class ContactStepTrace(Step):
         """Return the rates of a segment, by link, with what forces between its bodies and others add."""
         return rates
 
-    def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, tuple[Vector, Vector]]) -> dict[int, Value]:
+    def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, Twist]) -> dict[int, Value]:
         """Return qd' - qd by dof with the forces between bodies; ``alpha`` becomes that of the links."""
         return gains
 

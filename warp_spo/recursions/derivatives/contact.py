@@ -36,7 +36,7 @@ from ...scene.parts import DOF_VALUES
 from ...trace.differentiation import reverse
 from ...trace.emission import Store
 from ...trace.scalars import Scalar, Value, cut, is_constant, less, ordered, select
-from ...trace.spatial import ZERO, Articulated, Vector, dot, total
+from ...trace.spatial import ZERO, Articulated, Twist, Vector, dot, total
 from ..articulated_sweeps import NO_TERMS, Factors, eliminate, expand, reduce
 from ..contact.ground import CORNERS
 from ..contact.points import (
@@ -73,7 +73,7 @@ ORIGIN = "ground_origin"
 OF_DOFS = ("q", "qd", "tau", "target_q", "target_qd", "joint_rest_q", *DOF_VALUES)
 BY_SEGMENTS = (*OF_DOFS, "ctrl", *CONTACT_VALUES, HEIGHTS, ORIGIN, START, KICK, PATH)
 """Arguments and values whose gradient a segment computes by itself, or by messages between segments."""
-Twists = dict[int, tuple[Vector, Vector]]
+Twists = dict[int, Twist]
 
 
 class PassAdjoint(OnePass):
@@ -148,7 +148,7 @@ class PassAdjoint(OnePass):
             found[id(link)] = self._read_twist(link, carried_velocity(place, over, hinge_motion(link, place, rate)))
         return found
 
-    def _read_twist(self, link: Link, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    def _read_twist(self, link: Link, twist: Twist) -> Twist:
         """Return a twist of a link, as what follows from it reads it."""
         return twist
 
@@ -191,7 +191,7 @@ class PassAdjoint(OnePass):
 class PassSolve(PassAdjoint):
     """The solve of a pass, and the cotangents of what the pass before left."""
 
-    def _read_twist(self, link: Link, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    def _read_twist(self, link: Link, twist: Twist) -> Twist:
         return _cut(twist[0]), _cut(twist[1])
 
     def stores(self) -> list[Store]:  # type: ignore[override]
@@ -285,7 +285,7 @@ class PassGradient(PassAdjoint):
             move = move._replace(spin=travel[0], whirl=whirl(travel[0]))
         return ContactLinkMotion(axes, origins, twist, move, bend, travel)
 
-    def _read_twist(self, link: Link, twist: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    def _read_twist(self, link: Link, twist: Twist) -> Twist:
         if id(link) not in self._reached:
             return twist
         if link is self._end:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from ...trace.emission import Store, merge
 from ...trace.scalars import Value
-from ...trace.spatial import ZERO, Rigid, Vector, cross, dot
+from ...trace.spatial import ZERO, Rigid, Twist, Vector, Wrench, cross, dot
 from .. import composite, motion, newton_euler
 from ..model import messages
 from ..model.links import Link, LinkPlacement
@@ -31,7 +31,7 @@ def inverse_dynamics_derivatives(trace: Trace, mass: bool = True) -> list[Store]
     """out [3, dof, dof] = d tau / d q along the tangent coordinates, d tau / d qd, Mass; [2, ...] without ``mass``"""
     qdd, moves = trace.vector("qdd"), "qd" in trace.inputs
     rates = trace.vector("qd") if moves else None
-    alpha: dict[int, tuple[Vector, Vector]] = {}
+    alpha: dict[int, Twist] = {}
     own: dict[int, tuple[list[Sensitivity], list[Sensitivity]]] = {}
     letters = messages.needed(LETTERS, trace.inputs)
     inner: dict[str, dict[int, list[Value]]] = {letter: {} for letter in letters}  # what links hand to their parents
@@ -105,13 +105,7 @@ def _sum_of_links(
 
 
 def _entries(
-    trace: Trace,
-    link: Link,
-    all_in: CarriedSums,
-    force: tuple[Vector, Vector],
-    own: dict,
-    drifts: dict[int, Vector],
-    shared: dict,
+    trace: Trace, link: Link, all_in: CarriedSums, force: Wrench, own: dict, drifts: dict[int, Vector], shared: dict
 ) -> list[Store]:
     """Return the entries of the three blocks for each dof of the link, paired with the dofs of its hinge and ancestors.
 
@@ -180,8 +174,8 @@ def mass_matrix_derivative(trace: Trace) -> list[Store]:
     Moving link k turns all that it carries against what is above it. So Mass changes where columns from above, as
     the link sees them, meet its composite inertia, or the momenta that dofs below it hand on.
     """
-    heads: dict[int, dict[int, tuple[Vector, Vector]]] = {}  # H* of the dofs above a link and of its own
-    tails: dict[int, dict[int, tuple[Vector, Vector]]] = {}  # R H* of the dofs below it
+    heads: dict[int, dict[int, Twist]] = {}  # H* of the dofs above a link and of its own
+    tails: dict[int, dict[int, Twist]] = {}  # R H* of the dofs below it
     bodies: dict[int, Rigid] = {}
     stores: list[Store] = []
     for link, outward in trace.traversal():
@@ -195,7 +189,7 @@ def mass_matrix_derivative(trace: Trace) -> list[Store]:
             heads[key] |= zip(link.dofs, sensitivity.columns(link, trace.places[key]), strict=True)
             continue
         trace.label(link, "t")
-        body, below = link.inertia or composite.NOTHING, dict[int, tuple[Vector, Vector]]()
+        body, below = link.inertia or composite.NOTHING, dict[int, Twist]()
         for child in link.children:
             pose = trace.places[id(child)].pose
             body = body + pose.rigid_to_parent(bodies[id(child)])
@@ -220,7 +214,7 @@ def mass_matrix_derivative(trace: Trace) -> list[Store]:
     return merge(stores) if trace.links.shares_dofs else stores
 
 
-def _column_changes(link: Link, place: LinkPlacement, heads: dict, dof: int) -> dict[int, tuple[Vector, Vector]]:
+def _column_changes(link: Link, place: LinkPlacement, heads: dict, dof: int) -> dict[int, Twist]:
     """Changes of the columns H*, in the link's axes, when the link moves by one of its own dofs."""
     theta, d = heads[dof]
     changes = link.hinge.column_changes(place)
@@ -233,5 +227,5 @@ def _column_changes(link: Link, place: LinkPlacement, heads: dict, dof: int) -> 
     return found
 
 
-def _power(velocity: tuple[Vector, Vector], momentum: tuple[Vector, Vector]) -> Value:
+def _power(velocity: Twist, momentum: Wrench) -> Value:
     return dot(velocity[0], momentum[0]) + dot(velocity[1], momentum[1])

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from ...trace.differentiation import reverse
 from ...trace.emission import Store
 from ...trace.scalars import Value, cut, is_constant, ordered
-from ...trace.spatial import ZERO, Matrix, Rigid, Vector, cross, dot, skew
+from ...trace.spatial import ZERO, Matrix, Rigid, Twist, Vector, cross, dot, skew
 from ..model.links import Link, LinkPlacement
 from ..motion import armature_forces, hinge_motion, own_bias, whirl
 
@@ -91,9 +91,7 @@ class Power:
         stores: messages to other segments. forces: tau, by dof.
     """
 
-    def __init__(
-        self, trace: Trace, multiplier: Entry, qdd: Entry, base: tuple[Vector, Vector] | None = None, moves: bool = True
-    ):
+    def __init__(self, trace: Trace, multiplier: Entry, qdd: Entry, base: Twist | None = None, moves: bool = True):
         self.trace, self.gradients, self.stores = trace, Gradients(), list[Store]()
         self.forces: dict[int, Value] = {}
         self.rate: Entry = trace.vector("qd") if moves else lambda dof: 0.0

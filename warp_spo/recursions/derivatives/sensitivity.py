@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from ...trace.scalars import Value
-from ...trace.spatial import ZERO, Matrix, Rigid, Vector, cross, dot, skew, symmetric
+from ...trace.spatial import ZERO, Matrix, Rigid, Twist, Vector, Wrench, cross, dot, skew, symmetric
 from ..model.links import Link, LinkPlacement
 from ..motion import NONE, VelocityTerms, carry_acceleration, hinge_motion, whirl
 
@@ -75,7 +75,7 @@ class CarriedSums(NamedTuple):
         trace = Y[0][0] + Y[1][1] + Y[2][2]
         return Matrix.of([[2.0 * ((trace if i == j else 0.0) - Y[i][j]) for j in range(3)] for i in range(3)])
 
-    def force(self, s: Sensitivity) -> tuple[Vector, Vector]:
+    def force(self, s: Sensitivity) -> Wrench:
         """Change of (n; f), seen from the link."""
         n, f = self.body.apply(s.w, s.v)
         n = n + self.coriolis @ s.spin + self.load @ s.turn
@@ -157,8 +157,8 @@ def of_coordinates(
     place: LinkPlacement,
     motion: VelocityTerms,
     parent: VelocityTerms,
-    above: tuple[Vector, Vector],
-    own: tuple[Vector, Vector],
+    above: Twist,
+    own: Twist,
     rates: Any,
     qdd: Any,
 ) -> list[Sensitivity]:
@@ -224,7 +224,7 @@ def of_rates(
     return [s._replace(w=s.w + w, v=s.v + v) for s, (w, v) in zip(found, changes, strict=True)]
 
 
-def columns(link: Link, place: LinkPlacement) -> list[tuple[Vector, Vector]]:
+def columns(link: Link, place: LinkPlacement) -> list[Twist]:
     """(w; v) of H* for each dof."""
     return [
         hinge_motion(link, place, lambda other, dof=dof: 1.0 if other == dof else 0.0)  # type: ignore[misc]

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ...trace.scalars import Value, absolute, guarded, reciprocal, sqrt
-from ...trace.spatial import ZERO, Articulated, Vector, dot, total
+from ...trace.spatial import ZERO, Articulated, Twist, Vector, dot, total
 from .. import articulated, newton_euler
 from ..articulated import NO_INERTIA
 from ..model.links import Link, LinkPlacement, Links
@@ -240,7 +240,7 @@ def hinge_forces(
     stiffened: Callable[[Link], Link] = lambda link: link,
 ) -> tuple[Columns, Vector]:
     """Return t by dof, and z in the parent's frame, at ``qdd`` and alpha(p) = 0; ``loads`` holds z of each link."""
-    alpha: dict[int, tuple[Vector, Vector]] = {}
+    alpha: dict[int, Twist] = {}
     for link in cluster.links:
         above = alpha.get(id(link.parent), (ZERO, ZERO))
         alpha[id(link)] = newton_euler.link_acceleration(link, places[id(link)], motions[id(link)], above, qdd)
@@ -267,9 +267,7 @@ def hinge_forces(
     return tau, handed
 
 
-def expand_cluster(
-    cluster: Cluster, done: ClusterFactor, rates: list[Value], k: Columns, above: tuple[Vector, Vector]
-) -> Columns:
+def expand_cluster(cluster: Cluster, done: ClusterFactor, rates: list[Value], k: Columns, above: Twist) -> Columns:
     """Return qdd by dof, for rates = D^-1 eps and the acceleration ``above`` of the parent."""
     alpha = (*above[0], *above[1])
     y = [a - b for a, b in zip(rates, done.solve([dot(column, alpha) for column in done.U]), strict=True)]

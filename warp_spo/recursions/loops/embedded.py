@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ...trace.emission import Store
 from ...trace.scalars import Value
-from ...trace.spatial import Articulated, Vector, total
+from ...trace.spatial import Articulated, Twist, Vector, total
 from .. import articulated, newton_euler
 from ..articulated import HERE, NO_INERTIA
 from ..articulated_sweeps import NO_TERMS, StepTerms
@@ -212,15 +212,13 @@ class ClosedLoops:
             force = force + column * rate
         return done.P, force
 
-    def outward_accelerations(self, swept: Swept, base: tuple[Vector, Vector]) -> Columns:
+    def outward_accelerations(self, swept: Swept, base: Twist) -> Columns:
         """Return qdd by dof."""
         return self.outward_motion(swept, base)[0]
 
-    def outward_motion(
-        self, swept: Swept, base: tuple[Vector, Vector]
-    ) -> tuple[Columns, dict[int, tuple[Vector, Vector]]]:
+    def outward_motion(self, swept: Swept, base: Twist) -> tuple[Columns, dict[int, Twist]]:
         """Return qdd by dof, and the accelerations of the links by id."""
-        alpha: dict[int, tuple[Vector, Vector]] = {}
+        alpha: dict[int, Twist] = {}
         qdd: Columns = {}
         for link in self.trace.links.links:
             self.trace.label(link, "a")

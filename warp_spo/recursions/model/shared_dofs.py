@@ -16,7 +16,7 @@ import dataclasses
 from typing import NamedTuple
 
 from ...trace.scalars import Value, guarded, reciprocal, select
-from ...trace.spatial import ZERO, Articulated, Vector, dot, total
+from ...trace.spatial import ZERO, Articulated, Twist, Vector, dot, total
 from ..articulated import LEAST, NO_INERTIA, columns
 from ..motion import VelocityTerms
 from .link import Link
@@ -151,7 +151,7 @@ def reduce(
     return rates, forces_at_rest, z if done.links[0].parent is not None else NO_FORCE
 
 
-def expand(done: SharedFactor, rates: list[Value], above: tuple[Vector, Vector]) -> tuple[list[Value], list[Value]]:
+def expand(done: SharedFactor, rates: list[Value], above: Twist) -> tuple[list[Value], list[Value]]:
     """Return qdd of the group's dofs, and the forces that their rows of Mass feel, for the acceleration ``above``."""
     alpha, qdd, row_forces = Vector((*above[0], *above[1])), list[Value](), list[Value]()
     for pivot, rate in zip(done.pivots[::-1], rates[::-1], strict=True):

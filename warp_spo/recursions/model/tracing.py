@@ -12,7 +12,7 @@ from typing import Any
 
 from ...trace.emission import Store
 from ...trace.scalars import Value
-from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross
+from ...trace.spatial import IDENTITY, ZERO, Matrix, Twist, Vector, cross
 from .. import motion, newton_euler
 from ..motion import STILL, VelocityTerms
 from .exchange import Exchange, WholeTree
@@ -123,7 +123,7 @@ class Trace:
         return Vector(constants.of_body(at, "offset", placement.offset)) + turned
 
     @property
-    def base_acceleration(self) -> tuple[Vector, Vector]:
+    def base_acceleration(self) -> Twist:
         """Angular and linear acceleration of the inertial frame that stand for gravity."""
         return ZERO, -self.links.gravity
 
