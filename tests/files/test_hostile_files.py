@@ -8,6 +8,7 @@ import pytest
 
 import warp_spo as spo
 
+pytestmark = pytest.mark.filterwarnings("ignore:load.*left out")
 LINK = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
 
 
@@ -94,3 +95,105 @@ def test_a_chain_of_thousands_of_links_is_read(tmp_path):
     file.write_text(robot(*map(link, range(count)), *(joint(i, i + 1) for i in range(count - 1))))
     scene = spo.load(file)
     assert scene.dof_count == count - 1 and scene.tree.depth >= count - 2
+
+
+# -- MJCF --------------------------------------------------------------------------------------------------------------
+def mjcf(*parts, head="", top=""):
+    return f"{head}<mujoco>{top}<worldbody>{''.join(parts)}</worldbody></mujoco>"
+
+
+def limb(name="a", inner="", pos="0 0 0", mass="1"):
+    return f'<body name="{name}" pos="{pos}"><joint name="{name}"/><geom size=".1" mass="{mass}"/>{inner}</body>'
+
+
+def shaped(file):
+    mesh = f'<asset><mesh name="m" file="{file}"/></asset>'
+    return mjcf(limb("a", '<body><joint/><geom type="mesh" mesh="m"/></body>'), top=mesh)
+
+
+def copies(*counts):
+    return "".join(f'<replicate count="{count}" offset="1 0 0">' for count in counts), "</replicate>" * len(counts)
+
+
+EQUALITY = "</worldbody><equality>{}</equality><worldbody>"
+HOSTILE = {
+    "a billion laughs": mjcf(limb("&a9;"), head=BOMB),
+    "an external entity": mjcf(limb("&secret;"), head=OUTSIDE),
+    "20,000 levels of unknown elements": mjcf(DEEP),
+    "20,000 levels of bodies": mjcf("<body><joint/><geom size='.1'/>" * 20_000 + "</body>" * 20_000),
+    "a billion copies": mjcf(limb().join(copies(10**9))),
+    "a billion copies by three": mjcf(limb().join(copies(1000, 1000, "1e3"))),
+    "a billion parts of a cloth": mjcf('<body name="b"><flexcomp name="f" type="grid" count="1000 1000 1000"/></body>'),
+    "a field of 1e12 points": mjcf(limb(), top='<asset><hfield name="h" nrow="1000000" ncol="1000000"/></asset>'),
+    "a picture of 1e12 points": mjcf(limb(), top='<asset><texture width="1000000" height="1000000"/></asset>'),
+    "two billion keyframes": mjcf(limb(), top='<size nkey="2000000000"/>'),
+    "two billion values of users": mjcf(limb(), top='<size nuser_body="2000000000"/>'),
+    "a terabyte of memory": mjcf(limb(), top='<size memory="1000000G"/>'),
+    "a file that includes itself": mjcf('<include file="hostile.xml"/>', limb()),
+    "a file that attaches itself": mjcf(
+        limb(), '<attach model="x" body="a" prefix="p"/>', top='<asset><model name="x" file="hostile.xml"/></asset>'
+    ),
+    "a file of others": mjcf('<include file="../../../../../../../etc/passwd"/>', limb()),
+    "a model of others": mjcf(limb(), top='<asset><model name="x" file="/etc/passwd"/></asset>'),
+    "a mesh of others": shaped("/etc/passwd"),
+    "a device for a mesh": shaped("/dev/zero"),
+    "a joint tied to itself": mjcf(limb(), EQUALITY.format('<joint joint1="a" joint2="a"/>')),
+    "a number of a megabyte": mjcf(limb(mass="9" * 1_000_000)),
+    "an infinite mass": mjcf(limb(mass="inf")),
+    "a place that is no number": mjcf(limb(pos="nan 0 0")),
+    "a torn file": mjcf(limb())[:-25],
+    "UTF-16": mjcf(limb("föö"), head='<?xml version="1.0" encoding="utf-16"?>').encode("utf-16"),
+    "Latin-1": mjcf(limb("föö"), head='<?xml version="1.0" encoding="latin-1"?>').encode("latin-1"),
+    "no file at all": "\0\1\2\3" * 100,
+    "nothing": "",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_mjcf_is_refused_by_an_error_that_names_the_file(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where MuJoCo writes its log
+    file, text = tmp_path / "hostile.xml", HOSTILE[name]
+    file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ValueError, match=r"hostile\.xml") as error:
+        spo.load(file)
+    assert len(str(error.value)) < 2000 and "root:" not in str(error.value)
+
+
+def test_mjcf_opens_no_connection(tmp_path, monkeypatch):
+    """A DTD, an include, a model, a mesh and a texture at a server of this machine: nobody calls there."""
+    monkeypatch.chdir(tmp_path)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"http://127.0.0.1:{server.getsockname()[1]}/a"
+        texts = [
+            mjcf(limb(), head=f'<!DOCTYPE mujoco SYSTEM "{url}.dtd">'),
+            mjcf(f'<include file="{url}.xml"/>', limb()),
+            mjcf(limb(), top=f'<asset><model name="x" file="{url}.xml"/></asset>'),
+            mjcf(limb(), top=f'<asset><texture name="x" type="2d" file="{url}.png"/></asset>'),
+            shaped(f"{url}.stl"),
+        ]
+        found = []
+        for text in texts:
+            (tmp_path / "hostile.xml").write_text(text)
+            try:
+                found.append(spo.load(tmp_path / "hostile.xml").body_count)
+            except ValueError as error:
+                found.append("hostile.xml" in str(error))
+        server.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            server.accept()
+    assert found == [1, True, True, 1, True]  # a picture is not needed
+
+
+def test_ties_in_a_circle_are_read(tmp_path):
+    ties = '<joint joint1="a" joint2="b"/><joint joint1="b" joint2="a"/>'
+    (tmp_path / "robot.xml").write_text(mjcf(limb("a"), limb("b"), EQUALITY.format(ties)))
+    assert len(spo.load(tmp_path / "robot.xml").couplings) == 2
+
+
+@pytest.mark.slow
+def test_five_thousand_bodies_of_mjcf_are_read(tmp_path):
+    chains = (
+        "".join(f'<body name="{i}_{j}"><joint range="-1 1"/><geom size=".1"/>' for j in range(50)) for i in range(100)
+    )
+    (tmp_path / "robot.xml").write_text(mjcf(*(chain + "</body>" * 50 for chain in chains)))
+    assert spo.load(tmp_path / "robot.xml").dof_count == 5000

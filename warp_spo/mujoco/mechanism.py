@@ -67,7 +67,8 @@ class Mechanism:
     def _body(self, body: int) -> Body:
         m = self.source.model
         axes = rotation(m.body_iquat[body])
-        inertia = (axes * m.body_inertia[body]) @ axes.T
+        with np.errstate(invalid="ignore"):  # Body refuses what is not finite
+            inertia = (axes * m.body_inertia[body]) @ axes.T
         inertia[np.abs(inertia) <= ROUNDING * np.abs(inertia).max()] = 0.0
         passive = not (self.source.disabled("SPRING") and self.source.disabled("DAMPER"))  # MuJoCo skips all, then
         return Body(

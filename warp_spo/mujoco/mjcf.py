@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import mujoco
 
 from ..scene.collision_shapes import NONE, ShapeSelection
 from ..scene.scene import Scene
+from .expansion import check_expansion
 from .model import scene_of
 from .source import Source
 
@@ -19,11 +19,11 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool = True, selection:
     """Return the scene of an MJCF file; see :func:`warp_spo.load`. ``repair`` changes nothing: MuJoCo repairs nothing.
 
     Raises:
-        ET.ParseError: the file is not XML.
-        ValueError: the file is not MJCF, or MuJoCo refuses it; the message holds MuJoCo's.
+        xml.etree.ElementTree.ParseError: the file is not XML.
+        ValueError: the file is not MJCF, expands without bounds, or MuJoCo refuses it; the message holds MuJoCo's.
         UnsupportedError: as :func:`from_mujoco`; the message names the file, too.
     """
-    tag = ET.parse(file).getroot().tag
+    tag = check_expansion(file)
     if tag != "mujoco":
         raise ValueError(
             f"load: {str(file)!r} holds <{tag}>; expected <mujoco>; if it is URDF, let its name end in .urdf"
@@ -43,19 +43,23 @@ def compiled(file: Path) -> tuple[mujoco.MjModel, list[str], dict[int, str]]:
     """
     try:
         return mujoco.MjModel.from_xml_path(os.fspath(file)), [], {}
-    except ValueError as error:
+    except REFUSALS as error:
         refusal = _one_line(error)
     for unneeded in (UNNEEDED, (*UNNEEDED, *OF_CONTACT)):
         try:
             spec = mujoco.MjSpec.from_file(os.fspath(file))
             dropped, shapeless = _drop(spec, unneeded)
             model = spec.compile()
-        except ValueError as error:
+        except REFUSALS as error:
             last = error
             continue
         missing = {int(geom.id): kind for geom, kind in shapeless}
         return model, [f"{', '.join(dropped)}, with which MuJoCo refuses the file ({refusal})"], missing
     raise ValueError(f"load: {str(file)!r}: MuJoCo refuses it: {_one_line(last)}; correct the file") from None
+
+
+REFUSALS = (ValueError, RuntimeError, MemoryError, mujoco.FatalError, mujoco.UnexpectedError)
+"""What MuJoCo's compiler raises, of memory that it does not get, too."""
 
 
 UNNEEDED, OF_CONTACT = ("sensors", "skins", "tuples"), ("pairs", "excludes")
@@ -73,7 +77,9 @@ def _drop(spec: Any, unneeded: tuple[str, ...]) -> tuple[list[str], list[tuple[A
         for element in elements:
             spec.delete(element)
         dropped += [f"{len(elements)} {name}"] if elements else []
-    for texture in spec.textures:
+    textures = list(spec.textures)
+    dropped += [f"the pictures of {len(textures)} textures"] if textures else []
+    for texture in textures:
         texture.file, texture.cubefiles = "", [""] * 6
         texture.builtin, texture.width, texture.height = mujoco.mjtBuiltin.mjBUILTIN_FLAT, 1, 1
         texture.nchannel = 3
