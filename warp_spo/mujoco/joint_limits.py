@@ -21,6 +21,7 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
+from ..scene.parts import UNLIMITED
 from .source import Source
 
 MINVAL, LEAST, MOST = 1e-15, 1e-4, 0.9999  # mjMINVAL, mjMINIMP, mjMAXIMP of MuJoCo
@@ -78,63 +79,57 @@ class JointLimits:
     """
 
     def __init__(self, source: Source):
-        m = source.model
-        self._model, self._data = m, mujoco.MjData(m)
-        mujoco.mj_kinematics(m, self._data)
-        self._gravity = EARTH if source.disabled("GRAVITY") or not m.opt.gravity.any() else np.array(m.opt.gravity)
+        m, data = source.model, mujoco.MjData(source.model)
+        mujoco.mj_kinematics(m, data)
+        self._model = m
         self._least_time = 0.0 if source.disabled("REFSAFE") else 2.0 * m.opt.timestep
+        gravity = EARTH if source.disabled("GRAVITY") or not m.opt.gravity.any() else np.array(m.opt.gravity)
+
         masses = m.body_mass * (1.0 - m.body_gravcomp)
-        self._mass, self._moment = masses.copy(), masses[:, None] * self._data.xipos  # of limbs [kg], [kg m]
+        limb_mass, moment = masses.copy(), masses[:, None] * data.xipos
         for body in range(m.nbody - 1, 0, -1):
-            self._mass[m.body_parentid[body]] += self._mass[body]
-            self._moment[m.body_parentid[body]] += self._moment[body]
+            limb_mass[m.body_parentid[body]] += limb_mass[body]
+            moment[m.body_parentid[body]] += moment[body]
+
+        mass, axis = limb_mass[m.jnt_bodyid], data.xaxis  # [joint]
+        arm = moment[m.jnt_bodyid] / np.where(mass == 0.0, 1.0, mass)[:, None] - data.xanchor
+        across = np.cross(np.cross(axis, arm), axis)  # the arm, square to the axis
+        slides, force = m.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE, mass[:, None] * gravity
+        turned = np.cross(axis, across)  # the arm after a quarter turn
+        self._now = _dots(axis, np.where(slides[:, None], force, np.cross(across, force)))
+        self._turned = _dots(axis, np.cross(turned, force))
+        self._turns, self._reference = np.where(slides, 0.0, 1.0), m.qpos0[m.jnt_qposadr]
+
+        inverse = m.dof_invweight0[m.jnt_dofadr]
+        self._inertia = 1.0 / np.where(inverse > 0.0, inverse, 1.0)
+        lever, gyration = np.linalg.norm(across, axis=1), np.sqrt(self._inertia / np.maximum(abs(mass), MINVAL))
+        lever = np.where(slides, 1.0, np.where(lever > ROUNDING * gyration, lever, gyration))
+        self._weight = lever * np.linalg.norm(force, axis=1)  # of limbs at their levers [N or N m]
 
     def gains(self, joint: int, lower: float, upper: float) -> tuple[float, float]:
         """Return the stiffness and the damping of a joint's limits, which are at ``lower`` and ``upper``."""
-        m = self._model
-        solimp, inverse = np.array(m.jnt_solimp[joint]), float(m.dof_invweight0[m.jnt_dofadr[joint]])
-        inertia = 1.0 / inverse if inverse > 0.0 else 1.0
-        k, b = limit_reference(m.jnt_solref[joint], solimp[1], self._least_time)
+        solimp, inertia, whole = np.array(self._model.jnt_solimp[joint]), self._inertia[joint], self._weight[joint]
+        k, b = limit_reference(self._model.jnt_solref[joint], solimp[1], self._least_time)
 
         def stiffness(depth: np.ndarray) -> np.ndarray:
             d = impedance(solimp, depth)
             return inertia * k * d**2 / (1.0 - d)
 
-        whole = self._weight(joint, inertia)
-        loads: list[OfDepth] = [
-            load
-            for load in (lambda r: -self._push(joint, lower - r), lambda r: self._push(joint, upper + r))
-            if load(np.zeros(1))[0] > ROUNDING * whole
-        ] or [lambda r: np.full(r.shape, whole)]
+        bounds: list[tuple[float, OfDepth]] = [
+            (lower, lambda r: -self._push(joint, lower - r)),
+            (upper, lambda r: self._push(joint, upper + r)),
+        ]
+        loads = [f for bound, f in bounds if abs(bound) < UNLIMITED and f(np.zeros(1))[0] > ROUNDING * whole]
+        loads = loads or [lambda r: np.full(r.shape, whole)]
         depth = np.exp(np.mean([np.log(rest_depth(stiffness, load)) for load in loads], keepdims=True))
         d = float(impedance(solimp, depth)[0])
-        return float(stiffness(depth)[0]), inertia * b * d / float(np.sqrt(1.0 - d))
-
-    def _weight(self, joint: int, inertia: float) -> float:
-        """Return the weight of a joint's limb [N], of a hinge times its lever [N m].
-
-        The lever is the distance of the limb's centre of mass from the axis, or its radius of gyration if that is zero.
-        """
-        mass = abs(self._mass[self._model.jnt_bodyid[joint]])
-        force = mass * float(np.linalg.norm(self._gravity))
-        if self._model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
-            return force
-        lever = float(np.linalg.norm(np.cross(self._data.xaxis[joint], self._arm(joint))))
-        gyration = float(np.sqrt(inertia / max(mass, MINVAL)))
-        return force * (lever if lever > ROUNDING * gyration else gyration)
+        return float(stiffness(depth)[0]), float(inertia * b * d / np.sqrt(1.0 - d))
 
     def _push(self, joint: int, positions: np.ndarray) -> np.ndarray:
         """Return the generalised force of the limb's weight on a joint at positions [N m or N]."""
-        axis, force = self._data.xaxis[joint], self._mass[self._model.jnt_bodyid[joint]] * self._gravity
-        if self._model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
-            return np.full(positions.shape, axis @ force)
-        angles = positions - self._model.qpos0[self._model.jnt_qposadr[joint]]
-        across = self._arm(joint) - axis * (axis @ self._arm(joint))
-        now, turned = (axis @ np.cross(arm, force) for arm in (across, np.cross(axis, across)))
-        return now * np.cos(angles) + turned * np.sin(angles)
+        angles = self._turns[joint] * (positions - self._reference[joint])
+        return self._now[joint] * np.cos(angles) + self._turned[joint] * np.sin(angles)
 
-    def _arm(self, joint: int) -> np.ndarray:
-        """Return the centre of mass of a joint's limb, from the joint's anchor [m], inertial axes."""
-        body = self._model.jnt_bodyid[joint]
-        mass = self._mass[body]
-        return self._moment[body] / mass - self._data.xanchor[joint] if mass else np.zeros(3)
+
+def _dots(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("ij,ij->i", a, b)
