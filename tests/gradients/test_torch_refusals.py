@@ -1,5 +1,7 @@
 """Calls that torch cannot differentiate, or not twice, raise an error that explains; nothing compiles late."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -214,3 +216,31 @@ def test_transforms_of_torch_are_refused_by_custom_ops_too(tree):
             call()
     with forward_ad.dual_level(), pytest.raises(ValueError, match="q has a forward-mode tangent"):
         op(forward_ad.make_dual(q, q))
+
+
+def test_a_gradient_that_no_call_gives_is_refused_by_variable(device):
+    """Where a tensor becomes a constant of a scene or of kernels an error names variable=; before, ranges lost it."""
+    scene = zoo.from_parents([-1], ["revolute"], 3)
+    dyn = spo.Dynamics(scene, 1, device=device, dtype="float64")
+    one = torch.ones(1, dtype=torch.float64, device=str(dyn.device), requires_grad=True)
+    wide = torch.stack([-one[0], one[0]])
+    named = {
+        "joint_stiffness": [lambda: dyn.set(joint_stiffness=one), lambda: scene.with_values(joint_stiffness=one)],
+        "...": [lambda: spo.Body(one[0]), lambda: spo.Actuator(0, force_range=wide),
+                lambda: spo.Actuator(0, ctrl_range=(0.0, one[0])), lambda: spo.Actuator(0, torque_speed=wide.abs())],
+        "ground_heights": [lambda: spo.HeightField(one * torch.ones_like(one)[:, None].expand(2, 2), 1.0)],
+    }  # fmt: skip
+    for name, calls in named.items():
+        for call in calls:
+            with pytest.raises(ValueError, match=rf"requires grad.*variable=\('?{re.escape(name)}"):
+                call()
+    with torch.no_grad(), pytest.warns(UserWarning, match="folded into the kernels' data"):
+        dyn.set(joint_stiffness=one)
+
+
+def test_a_warp_array_that_requires_grad_is_named_when_it_is_set(device):
+    dyn = spo.Dynamics(zoo.from_parents([-1], ["revolute"], 3), 1, device=device, variable=("joint_stiffness",))
+    stiffness = wp.ones((1, 1), dtype=float, device=dyn.device, requires_grad=True)
+    with pytest.warns(UserWarning, match="its gradient stays zero, because wp.Tape.*SolverSPO") as caught:
+        dyn.set(joint_stiffness=stiffness)
+    assert caught[0].filename == __file__

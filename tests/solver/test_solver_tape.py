@@ -1,6 +1,8 @@
 """SolverSPO inside wp.Tape: gradients against central differences in float64, and SolverFeatherstone's."""
 
 import itertools
+import re
+import warnings
 
 import newton
 import numpy as np
@@ -161,14 +163,14 @@ def made():
 def test_a_step_without_gradients_is_not_recorded(made):
     model, solver = made
     states = [model.state(requires_grad=False) for _ in range(2)]
-    variable = [getattr(model, name) for name in solver.dynamics.variable]
-    for array in variable:
+    followed = [array for array in vars(model).values() if isinstance(array, wp.array) and array.requires_grad]
+    for array in followed:
         array.requires_grad = False
     seen = pytest.warns(UserWarning, match="no array of state_in, .* requires grad, .*finalize")
     with wp.Tape() as tape, seen as caught:
         solver.step(*states, model.control(requires_grad=False), None, H)
     assert len(caught) == 1 and caught[0].filename == __file__
-    for array in variable:
+    for array in followed:
         array.requires_grad = True
     assert tape.launches == []
 
@@ -247,3 +249,30 @@ def test_gradients_are_featherstones():
         tape.zero()
     for ours, theirs in zip(*found.values(), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-3 * np.abs(theirs).max())
+
+
+def test_gradients_that_stay_zero_are_named_once():
+    """Arrays that require grad and are compiled into the kernels; named in variable=, they have gradients."""
+    model, told = (
+        smooth(arm()),
+        r"gradients of the model's joint_friction, joint_stiffness, .*joint_rest_q.*variable=\(",
+    )
+    model.joint_stiffness.fill_(2.0)
+    model.joint_rest_q.fill_(0.3)
+    first = moving(model)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        rollout(SolverSPO(model, contacts="none"), first, model.control())
+    assert len(caught) == 1 and re.search(told, str(caught[0].message)) and caught[0].filename == __file__
+    names = ("joint_stiffness", "joint_rest_q")
+    for name, array in vars(model).items():
+        if isinstance(array, wp.array) and name.startswith("joint_"):
+            array.requires_grad = name in (*names, "joint_q", "joint_qd")
+    solver = SolverSPO(model, contacts="none", variable=(*VALUES, *names))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        states, tape = rollout(solver, first, model.control())
+        states[-1].joint_qd.grad.fill_(1.0)
+        tape.backward()
+    for name in names:
+        assert np.abs(getattr(model, name).grad.numpy()).max() > 0.0

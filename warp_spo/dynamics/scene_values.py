@@ -18,6 +18,7 @@ from ..scene.contact_values import CONTACT_VALUES
 from ..scene.parts import real
 from ..scene.scene import refuse_negative
 from . import actuators
+from .operation import DIFFERENTIABLE
 from .refinement import Refinement
 
 if TYPE_CHECKING:
@@ -85,12 +86,29 @@ def _read(dyn: Dynamics, call: Call, name: str, value: Any) -> tuple[Any, Any]:
             value = real(value)
         except (TypeError, ValueError):
             raise TypeError(f"Dynamics.set: {name} is {value!r}; expected an array of numbers") from None
+    _refuse_lost_gradient(dyn, name, value)
     shape = dyn.scene.values[name].shape[1:]
     if len(shape_of(value)) > len(shape) and name not in SHARED:
         shape = (dyn.worlds, *shape)
     followed = name in dyn._gradients.values and records_gradient((value,))
     meaning = "[...], because all worlds share it" if name in SHARED else "[world, ...] or [...] as Newton has it"
     return value, call.read(name, value.detach() if followed else value, shape, meaning)
+
+
+def _refuse_lost_gradient(dyn: Dynamics, name: str, value: Any) -> None:
+    """Raise ValueError for a tensor that requires grad and a value that is folded; warn of such an array of Warp's."""
+    if name in DIFFERENTIABLE and name not in dyn.variable and records_gradient((value,)):
+        raise ValueError(
+            f"Dynamics.set: {name} requires grad and is folded into the kernels, which have no gradient by it; "
+            f"expected a variable value; build Dynamics with variable=({name!r},), or pass {name}.detach()"
+        )
+    if isinstance(value, wp.array) and value.requires_grad:
+        warnings.warn(
+            f"Dynamics.set: {name} is a Warp array that requires grad; its gradient stays zero, because wp.Tape sees "
+            f"no call of Dynamics; expected a torch tensor, of a Dynamics with variable=({name!r},), or SolverSPO in "
+            "the tape, or an array without gradient",
+            stacklevel=4,
+        )
 
 
 def reset(

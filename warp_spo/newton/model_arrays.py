@@ -10,6 +10,7 @@ import warp as wp
 from newton import ModelFlags
 
 from ..dynamics.dynamics import Dynamics
+from ..dynamics.operation import DIFFERENTIABLE
 from ..scene.parts import DOF_VALUES
 from .contacts import VALUES, Materials
 from .elevations import Elevations
@@ -91,6 +92,11 @@ class ModelArrays:
     def source(self, name: str) -> str:
         """Return the name of the model's array that a value of the scene comes from."""
         return next((array for array, value in VALUES.items() if value == name), name)
+
+    def differentiable(self) -> list[str]:
+        """Return the names of the model's arrays that have gradients where they are variable."""
+        joints = [name for name in self._layouts if name in DIFFERENTIABLE]
+        return [*joints, *(VALUES if self._sources else ())]
 
     def gradient(self, name: str) -> wp.array:
         """Return an array [world, ...] for the gradient by a value, see :meth:`add`."""

@@ -21,7 +21,7 @@ from ..dynamics.kinematics import BODY_POSES, BODY_VELOCITIES
 from ..dynamics.operation import DIFFERENTIABLE, Operation, derivative_of
 from ..dynamics.stepping.step import STEP
 from ..errors import UnsupportedError
-from .drives import Drives
+from .drives import GAINS, Drives
 from .joint_forces import JointForces
 from .layout import StateLayouts
 from .model_arrays import ModelArrays
@@ -82,6 +82,7 @@ class StepGradients:
     ):
         self.model, self.dynamics, self.layouts, self.passes = model, dynamics, layouts, passes
         self.forces, self.drives, self.arrays, self.prepare = forces, drives, arrays, prepare
+        self._says_what_lacks = True  # until the first record
 
     def record(
         self,
@@ -103,9 +104,10 @@ class StepGradients:
         values = [name for name in self.dynamics.variable if name in DIFFERENTIABLE and self.arrays.has_source(name)]
         model = {name: getattr(self.model, self.arrays.source(name)) for name in values}
         wanted = {name: array for name, array in {**read, **model}.items() if array.requires_grad}
+        self._warn_of_zeros(values)
         if not wanted:
             warnings.warn(
-                f"{CALL}: no array of state_in, of the control or of the model requires grad, so the tape does not "
+                f"{CALL}: no array of state_in, of the control or of variable= requires grad, so the tape does not "
                 "record the step; make the model with builder.finalize(requires_grad=True), or a state with "
                 "model.state(requires_grad=True)",
                 stacklevel=3,
@@ -138,6 +140,28 @@ class StepGradients:
         if _requires_grad(written, "body_qd"):
             self.dynamics._gradients.check(BODY_VELOCITIES)
         return StepRecord(self, tape, read, written, wanted, dt)
+
+    def _warn_of_zeros(self, values: list[str]) -> None:
+        """Warn once of the model's arrays that require grad and whose gradients stay zero.
+
+        ``values`` are those of the scene's values that have gradients.
+        """
+        if not self._says_what_lacks:
+            return
+        self._says_what_lacks = False
+        served = [self.arrays.source(name) for name in values]
+        known = [name for name in self.arrays.differentiable() if self.drives.any or name not in GAINS]
+        asked = [name for name in self.arrays.used if getattr(self.model, name).requires_grad]
+        lacking = [name for name in asked if name in known and name not in served]
+        if lacking:
+            none = [name for name in asked if name not in (*known, *GAINS)]
+            warnings.warn(
+                f"{CALL}: gradients of the model's {', '.join(lacking)} stay zero, although they require grad, because "
+                f"their numbers are compiled into the kernels; name those that you need in SolverSPO(model, "
+                f"variable=(..., {lacking[0]!r})), or let them not require grad"
+                + (f"; there are none by {', '.join(none)}" if none else ""),
+                stacklevel=4,
+            )
 
     def _arrays_read(self, state: newton.State, control: newton.Control) -> dict[str, Any]:
         """Return the arrays of a state and a control that a step reads, by name."""

@@ -82,7 +82,8 @@ def kind_of(array: object, call: str, name: str) -> str:
     if dlpack.is_traced(array):
         way = f"call warp_spo.jax.function(dyn, {call.rpartition('.')[2]!r}) there"
         if call == "Dynamics.set":
-            way = "set values outside of JAX's functions; they have no gradients in JAX: use torch for these"
+            way = f"set values outside of JAX's functions, or build Dynamics with variable=({name!r},) and give them "
+            way += f"to a warp_spo.jax.function(dyn, ..., values=({name!r},)), which has gradients by them"
         raise TypeError(
             f"{call}: {name} is traced by JAX (jit, grad or vmap), so it holds no numbers yet; expected an array with "
             f"numbers; {way}"

@@ -98,7 +98,7 @@ class Actuator:
             raise ValueError(f"{call}: strength is {self.strength}; expected zero or more")
         put("bias", tuple(checked_array(call, "bias", self.bias, (3,)).tolist()))
         for name in ("ctrl_range", "force_range"):
-            low, high = ends = tuple(float(end) for end in getattr(self, name))
+            low, high = ends = tuple(checked_array(call, name, getattr(self, name), (2,), finite=False).tolist())
             if not low <= high:
                 raise ValueError(f"{call}: {name} is {ends}; expected a lower end that is not above the upper end")
             put(name, ends)

@@ -7,21 +7,38 @@ from typing import Any
 import numpy as np
 
 from ..errors import refuse_masked
+from ..runtime.dlpack import is_traced
 
 SYMMETRY = 1e-6  # relative: what a float32 file or importer leaves of a symmetric inertia, a unit axis or quaternion
 
 
-def checked_array(call: str, name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+def checked_array(call: str, name: str, value: Any, shape: tuple[int, ...], finite: bool = True) -> np.ndarray:
     refuse_masked(call, name, value)
     try:
         array = real(value)
     except (TypeError, ValueError):
+        refuse_gradient(call, name, value)
         raise ValueError(f"{call}: {name} is {value!r}; expected numbers of shape {shape}") from None
     if array.shape != shape:
         raise ValueError(f"{call}: {name} has shape {array.shape}; expected {shape}")
-    if not np.isfinite(array).all():
+    if finite and not np.isfinite(array).all():
         raise ValueError(f"{call}: {name} is {array.tolist()}; expected finite numbers")
     return read_only(array)
+
+
+def refuse_gradient(call: str, name: str, value: Any, variable: str = "") -> None:
+    """Raise ValueError if torch or JAX takes derivatives by ``value``, because none passes through a scene.
+
+    ``variable`` is the name among the scene's values, if there is one.
+    """
+    listed = value if isinstance(value, list | tuple) else (value,)
+    if any(getattr(one, "requires_grad", False) or is_traced(one) for one in listed):
+        named = f"({variable!r},)" if variable else "(...), the names of values"
+        raise ValueError(
+            f"{call}: {name} requires grad, and a scene holds plain numbers, through which no derivative passes; "
+            f"expected numbers; pass them detached; for gradients build Dynamics with variable={named} and give the "
+            "tensor to Dynamics.set, or in JAX to a function with values="
+        )
 
 
 def real(value: Any) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .checks import checked_array, checked_unit
+from .checks import checked_array, checked_unit, refuse_gradient
 from .pickling import StoredPart
 
 HEIGHTS = "ground_heights"
@@ -70,6 +70,7 @@ class HeightField(StoredPart):
                 f"HeightField: heights has shape {shape}; expected (points along x, points along y), two or more each, "
                 "or (fields, points along x, points along y)"
             )
+        refuse_gradient("HeightField", "heights", self.heights, HEIGHTS)
         heights = np.asarray(self.heights)
         if heights.dtype.kind == "f" and not np.isfinite(heights).all():
             place = np.argwhere(~np.isfinite(heights))[0].tolist()

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import refuse_masked, shown
 from .actuators import RANGES, Actuator, Keyframe, actuator_values, check_actuator_value
-from .checks import SYMMETRY
+from .checks import SYMMETRY, refuse_gradient
 from .contact_values import CONTACT_VALUES, contact_values
 from .contacts import Contact, ContactPoint, check_contacts, contact_points
 from .flexible.modes import MASS_VALUES, check_modes, with_modes
@@ -421,6 +421,7 @@ class Scene(Stored):
         try:
             array = real(value)
         except (TypeError, ValueError):
+            refuse_gradient(call, name, value, name)
             raise ValueError(f"{call}: {name} is {value!r}; expected numbers of shape {shape}") from None
         if array.shape == shape:
             array = array[None]
