@@ -26,7 +26,7 @@ def worst(T) -> wp.Kernel:
 
     ``severity``: of each word.
     """
-    words = wp.types.vector(length=11, dtype=wp.int32)
+    words = wp.types.vector(length=12, dtype=wp.int32)
 
     @wp.kernel(module=f"warp_spo_combination_{T.__name__}", enable_backward=False)
     def kernel(severity: words, later: wp.array[int], status: wp.array[int]):

@@ -14,9 +14,10 @@ class Status(enum.IntEnum):
             print(spo.Status(number).name, (status == number).sum(), spo.Status(number).advice)
 
     The numbers never change. They are not ordered by severity. From the most severe to the least severe the order is
-    NOT_FINITE, LOOPS, PIVOT, RANGE, UNSUPPORTED, SLOTS, OPEN, CONTACT, NOT_SETTLED, DIGITS, OK; see :attr:`severity`.
-    NOT_FINITE and PIVOT come with results that are NaN, or not to be trusted; RANGE and LOOPS do where numbers leave
-    the range of the dtype or the rank is lost. With all others the result is finite, and off by what the name says.
+    QUATERNION, NOT_FINITE, LOOPS, PIVOT, RANGE, UNSUPPORTED, SLOTS, OPEN, CONTACT, NOT_SETTLED, DIGITS, OK; see
+    :attr:`severity`. QUATERNION, NOT_FINITE and PIVOT come with results that are NaN, or not to be trusted; RANGE and
+    LOOPS do where numbers leave the range of the dtype or the rank is lost. With all others the result is finite, and
+    off by what the name says.
     """
 
     OK = 0
@@ -42,6 +43,9 @@ class Status(enum.IntEnum):
     """More contacts were found than the scene has slots for; the surplus contacts were left out."""
     UNSUPPORTED = 10
     """Some contacts are of a kind that the solver cannot take; they were left out."""
+    QUATERNION = 11
+    """A quaternion among the coordinates is zero, or its square is below the normal numbers of the dtype: it is no
+    rotation."""
 
     @property
     def advice(self) -> str:
@@ -66,6 +70,7 @@ _BY_SEVERITY = (
     Status.PIVOT,
     Status.LOOPS,
     Status.NOT_FINITE,
+    Status.QUATERNION,
 )
 
 _ADVICE = {
@@ -96,4 +101,8 @@ _ADVICE = {
     Status.SLOTS: "Build the scene with more contact slots.",
     Status.UNSUPPORTED: "Take contacts of this kind out of the model, or give them shapes that the solver supports. "
     "For contacts between bodies list pairs: SolverSPO(model, pairs=...), or spo.Contact(..., other=...) in a scene.",
+    Status.QUATERNION: (
+        "Give q a quaternion that is not zero for this world, such as (0, 0, 0, 1) of a ball or free hinge that does "
+        "not turn: q of zeros is no configuration, scene.neutral_q is one. Quaternions need not be of unit length."
+    ),
 }

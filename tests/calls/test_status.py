@@ -12,7 +12,8 @@ from support.mechanisms import MECHANISMS
 from warp_spo import kernels
 
 NUMBERS = dict(
-    OK=0, PIVOT=1, NOT_FINITE=2, DIGITS=3, RANGE=4, NOT_SETTLED=5, LOOPS=6, OPEN=7, CONTACT=8, SLOTS=9, UNSUPPORTED=10
+    OK=0, PIVOT=1, NOT_FINITE=2, DIGITS=3, RANGE=4, NOT_SETTLED=5, LOOPS=6, OPEN=7, CONTACT=8, SLOTS=9, UNSUPPORTED=10,
+    QUATERNION=11,
 )  # fmt: skip
 
 
@@ -40,6 +41,7 @@ def test_kernels_hold_the_same_numbers():
         "NOT_SETTLED",
         "LOOPS",
         "OPEN",
+        "QUATERNION",
     }
 
 

@@ -16,7 +16,8 @@ from .segment.body_frames import FRAME, GEOMETRY
 from .segment.warp_specialized import HELD
 from .staging import FIELDS
 
-_SEVERITIES = hex(sum(word.severity << (4 * word) for word in Status)) + "ull"
+_LATER = [word for word in Status if word != Status.QUATERNION]  # which a substep leaves of unit length, or NaN
+_SEVERITIES = hex(sum(word.severity << (4 * word) for word in _LATER)) + "ull"
 _SEVERITY = f"({_SEVERITIES} >> 4 * {{}} & 15)".format
 _IS_WORSE = (  # as kernels.combination.worst: a state that an earlier substep lost is no input that is not finite
     f"!substep || ({_SEVERITY('word')} > {_SEVERITY('status_row[0]')} && "
