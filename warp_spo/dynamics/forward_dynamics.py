@@ -123,8 +123,8 @@ def forward_dynamics(
         status: int32 [world]. The call writes one :class:`warp_spo.Status` for each world, the worst that applies;
             None costs nothing. From worst to best:
 
-            * 11, QUATERNION: a quaternion in q is zero, or its square is below the dtype's normal numbers. The result is
-              NaN. Start from ``scene.neutral_q``; quaternions need not be of unit length.
+            * 11, QUATERNION: a quaternion in q is zero, or its square is below the dtype's normal numbers. The result
+              is NaN. Start from ``scene.neutral_q``; quaternions need not be of unit length.
             * 2, NOT_FINITE: an input, or a value of the scene, is NaN or infinite in this dtype. The result is not
               finite wherever that matters (infinite armature locks a hinge). Look where the number comes from.
             * 1, PIVOT: Mass is not positive definite to working precision, because of a massless leaf or a singular
@@ -140,8 +140,8 @@ def forward_dynamics(
             * 0, OK: none of these. If tau and gravity nearly cancel, digits can still be lost, as in any subtraction;
               pass gravity through the scene and wrenches through body_f, not through tau.
 
-            Where loops are closed, or bodies have modes or rotors, only 11, 2, 6 and 1 are written, because digits are not
-            estimated. Worlds never change each other's result.
+            Where loops are closed, or bodies have modes or rotors, only 11, 2, 6 and 1 are written, because digits are
+            not estimated. Worlds never change each other's result.
         out: array for the result.
 
     Returns:
