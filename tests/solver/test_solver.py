@@ -238,3 +238,27 @@ def test_a_nan_stays_in_its_world(turned):
     spoiled = advance(solver, moving(model), 2, control)
     np.testing.assert_array_equal(spoiled.joint_q.numpy()[:9], clean.joint_q.numpy()[:9])
     assert np.isnan(spoiled.joint_qd.numpy()[8:]).all()
+
+
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_every_step_fills_the_status(substeps):
+    """Without observables: a world keeps its most severe word until it is reset; a quaternion of zeros is named."""
+    builder, both = newton.ModelBuilder(), newton.ModelBuilder()
+    body = builder.add_link(mass=1.0, inertia=wp.mat33(np.diag([0.1, 0.2, 0.3])))
+    builder.add_articulation([builder.add_joint_free(body)])
+    both.replicate(builder, 3)
+    model = both.finalize(device="cpu")
+    solver = SolverSPO(model, contacts="none", substeps=substeps)
+    assert not solver.status.numpy().any()
+    state = model.state()
+    q = np.tile([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], (3, 1)).astype(np.float32)
+    q[0, 3:] = 0.0
+    q[1, 0] = np.nan
+    state.joint_q.assign(q.ravel())
+    expected = [spo.Status.QUATERNION, spo.Status.NOT_FINITE, spo.Status.OK]
+    for _ in range(2):
+        solver.step(state, state, None, None, H)
+        assert solver.status.numpy().tolist() == expected
+    solver.reset(state)
+    solver.step(state, state, None, None, H)
+    assert not solver.status.numpy().any()

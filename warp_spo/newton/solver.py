@@ -279,9 +279,8 @@ class SolverSPO(MassMatrixInterface, SolverBase):
     def status(self) -> wp.array:
         """The most severe :class:`warp_spo.Status` of each world since its last :meth:`reset`, int32 [world].
 
-        Steps with observables contribute the word that they compute. A step that is given contacts contributes
-        UNSUPPORTED in worlds that have some which it leaves out. Other steps contribute nothing: ask for the observable
-        ``status`` to know about them.
+        Every step of integrator="semi_implicit" contributes its word. A step that is given contacts contributes
+        UNSUPPORTED in worlds that have some which it leaves out; steps of other integrators contribute nothing else.
         """
         return self._words.kept
 
@@ -365,16 +364,18 @@ class SolverSPO(MassMatrixInterface, SolverBase):
         bodies = None
         if observables is None or not observables.kinds:
             q_out, qd_out = at.q.target(state_out.joint_q, "q_out"), at.qd.target(state_out.joint_qd, "qd_out")
-            if qdd is not None:  # the kernel of steps with observables
-                given["status"] = self._observable_arrays.status
+            status = self._observable_arrays.status if self.integrator == "semi_implicit" else None
             poses = velocities = None
             if contacts is None:  # which are marked by the poses before the step
                 bodies = self._bodies.targets(state_out)
                 poses, velocities = (None, None) if bodies is None else bodies
             report = StepReport(qdd=qdd, poses=poses, velocities=velocities)
-            self.dynamics.step(q, qd, dt=dt, options=options, report=report, out=(q_out, qd_out), **given)
+            out = q_out, qd_out
+            self.dynamics.step(q, qd, dt=dt, options=options, status=status, report=report, out=out, **given)
             if contacts is not None:
                 self._words.mark(contacts, self._words.kept, state_in.body_q)
+            if status is not None:
+                self._words.keep(status)
         else:  # observables are computed from the state before the step, which state_out must not overwrite yet
             q_out, qd_out = at.q.buffer("q_out"), at.qd.buffer("qd_out")
             qdd = at.qd.buffer("qdd") if qdd is None else qdd
