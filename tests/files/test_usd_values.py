@@ -157,7 +157,8 @@ def test_drives_that_accelerate(kind, metre, tmp_path):
         float drive:{axis}:physics:damping = 3
     """
     head = HEAD.replace("metersPerUnit = 1", f"metersPerUnit = {metre}")
-    scene, _ = loaded(tmp_path, swing(gains, kind, (f"PhysicsDriveAPI:{axis}",), head=head))
+    scene, warning = loaded(tmp_path, swing(gains, kind, (f"PhysicsDriveAPI:{axis}",), head=head))
+    assert f"drive:{axis}:physics:type, whose gains count for the inertia at q = 0 (/World/j)" in warning
     inertia = (1 + 2 * (0.2**2 + 0.3**2)) * metre**2 / DEGREE if kind == "Revolute" else 2
     assert only(scene, "joint_target_ke") == pytest.approx(6 * inertia, rel=SINGLE)
     assert only(scene, "joint_target_kd") == pytest.approx(3 * inertia, rel=SINGLE)

@@ -95,7 +95,7 @@ def _read(
     accelerated = joints.accelerated()
     if (metre, kilogram) != (1.0, 1.0):
         _convert(builder, metre, kilogram, found.get("physics_scene_path") is not None, accelerated)
-    _refuse_lost_bodies(call, stage, builder)
+    _refuse_lost_bodies(file, stage, builder)
     scene = scene_of(file, builder, repair, selection)
     scene = with_scaled_drives(call, scene, accelerated)
     scene = with_weightless_bodies(scene, weights_held_up(stage))
@@ -135,22 +135,22 @@ def _imported(stage: Any, floating: bool | None, density: float) -> tuple[newton
                 raise
 
 
-def _refuse_lost_bodies(call: str, stage: Any, builder: newton.ModelBuilder) -> None:
+def _refuse_lost_bodies(file: Path, stage: Any, builder: newton.ModelBuilder) -> None:
     """Raise UnsupportedError if the importer left out a body, or made one that no joint carries."""
     read = set(builder.body_label)
     lost = [path for path in _rigid_bodies(stage) if path not in read]
     if lost:
         raise UnsupportedError(
-            call,
-            f"bodies that Newton's importer leaves out ({quote_labels(lost)})",
+            "load",
+            f"{str(file)!r} with bodies that Newton's importer leaves out ({quote_labels(lost)})",
             "give each a joint without excludeFromArticulation, or take it out of the articulation root",
         )
     carried = set(builder.joint_child)
     loose = [label for body, label in enumerate(builder.body_label) if body not in carried]
     if loose:
         raise UnsupportedError(
-            call,
-            f"bodies that are body1 of no joint ({quote_labels(loose)})",
+            "load",
+            f"{str(file)!r} with bodies that are body1 of no joint ({quote_labels(loose)})",
             "join each to the world by a joint without body0, or put an articulation root above them all",
         )
 

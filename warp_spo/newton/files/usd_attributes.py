@@ -196,9 +196,17 @@ def _unread(
     for name, attribute in values.items():
         if matches(name, OF_SOLVERS) and name not in OF_FLUIDS:
             continue
+        if name.startswith("drive:") and attribute.Get() == "acceleration" and _has_gains(values, name):
+            yield f"{name}, whose gains count for the inertia at q = 0"
         taken = matches(name, read) and name not in beaten and not _changes(attribute)
         if not taken and not _says_nothing(prim, attribute):
             yield name
+
+
+def _has_gains(values: Mapping[str, Any], name: str) -> bool:
+    """Return whether the drive whose type ``name`` is has a stiffness or a damping."""
+    gains = [values.get(name.removesuffix("type") + gain) for gain in ("stiffness", "damping")]
+    return any(gain is not None and gain.Get() for gain in gains)
 
 
 def _changes(attribute: Any) -> bool:
