@@ -131,7 +131,7 @@ NEUTRAL: dict[str, tuple[Any, ...]] = {
 """Values that mean nothing, of attributes that no schema at hand defines; of others it is zero, false or empty."""
 UNBOUNDED = 1e30
 """What is above is without bound: files write the largest number of float32 for it."""
-MOST = 24
+MOST = 100
 """Names of attributes in one warning."""
 
 
@@ -147,7 +147,7 @@ def left_out(stage: Any, loops: set[str], joints: set[str], scene_path: str | No
         path = str(prim.GetPath())
         for what in _unread(prim, path, loops, joints, scene_path, contacts):
             found.setdefault(what, []).append(path)
-    words = [f"{shown(what)} ({_places(paths)})" for what, paths in found.items()]
+    words = [f"{shown(what, 120)} ({_places(paths)})" for what, paths in found.items()]
     return words[:MOST] + ([f"and {len(words) - MOST} more attributes"] if len(words) > MOST else [])
 
 
