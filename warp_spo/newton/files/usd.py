@@ -197,6 +197,11 @@ def _convert(
                 continue
             if column[dof] != unset:  # a default is one in SI units
                 column[dof] *= kilogram**mass * metre**length
+    for start, kind, (linear, _) in zip(values.joint_q_start, values.joint_type, values.joint_dof_dim, strict=True):
+        if kind in (newton.JointType.PRISMATIC, newton.JointType.D6):
+            values.joint_rest_q[start : start + linear] = [
+                metre * q for q in values.joint_rest_q[start : start + linear]
+            ]
     length_of = [metre if linear else 1.0 for linear, _ in values.joint_dof_dim]
     for joint, reference in enumerate(values.joint_mimic_joint):
         if reference >= 0:

@@ -183,7 +183,7 @@ def _unread(
         for part, schema in {"body": "RigidBodyAPI", "shape": "CollisionAPI", "material": "MaterialAPI"}.items()
         if f"Physics{schema}" in schemas
     ]
-    read: Names = CONTACT_READ if contacts else OF_CONTACT
+    read: Names = CONTACT_READ if contacts else ("physics:collisionEnabled",) if kind in READ else OF_CONTACT
     for part in parts:
         for api, names in READ[part].items():
             if not api or any(matches(schema, (api,)) for schema in schemas):
