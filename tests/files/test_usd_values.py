@@ -308,6 +308,44 @@ def test_attributes_of_contact_are_named_if_contacts_are_asked_for(tmp_path):
     assert scene.contacts and "mjc:solref (/World/arm/ball)" in warning
 
 
-def test_a_joint_of_a_body_that_is_not_enabled_is_refused(tmp_path):
+def test_a_body_that_is_not_enabled_stands_still(tmp_path):
+    """In an articulation and outside of one; a joint that carries it is refused."""
+    off = "bool physics:rigidBodyEnabled = 0"
+    for root in ('(prepend apiSchemas = ["PhysicsArticulationRootAPI"])', ""):
+        scene, _ = loaded(tmp_path, stage(body("arm"), body("rock", off), root=root))
+        assert scene.body_labels == ["/World/arm"]
     with pytest.raises(spo.UnsupportedError, match="'/World/arm', which is not enabled"):
-        loaded(tmp_path, swing(body_more="bool physics:rigidBodyEnabled = 0"))
+        loaded(tmp_path, swing(body_more=off))
+
+
+@pytest.mark.parametrize(
+    ("kind", "q", "turned"), [("Spherical", [0.6, 0, 0.48, 0.64], [-0.6, 0, -0.48, 0.64]), ("", [0.3], [-0.3])]
+)
+def test_other_joints_with_their_bodies_exchanged(kind, q, turned, tmp_path):
+    """A ball turns the other way; a joint of no type may have one free axis."""
+    locked = [axis for axis in ("transX", "transY", "transZ", "rotX", "rotZ") if not kind]
+    limits = "".join(f"float limit:{a}:physics:low = 1\nfloat limit:{a}:physics:high = -1\n" for a in locked)
+    apis = tuple(f"PhysicsLimitAPI:{axis}" for axis in locked)
+    fixed, frames = joint("weld", None, "base", kind="Fixed"), FRAMES.partition("float")[0]
+    forward = joint("j", "base", "arm", frames.format(0, 0, 1, 1) + limits, kind, apis)
+    back = joint("j", "arm", "base", frames.format(1, 1, 0, 0) + limits, kind, apis)
+    poses = []
+    for text, state in ((forward, q), (back, turned)):
+        scene, warning = loaded(tmp_path, stage(body("base"), body("arm"), fixed, text))
+        poses.append(Dense(scene, state).body_matrix[scene.body_labels.index("/World/arm")])
+        assert not warning
+    np.testing.assert_allclose(poses[0], poses[1], atol=SINGLE)
+    free = joint("j", "arm", "base", kind="")
+    with pytest.raises(spo.UnsupportedError, match="whose body0 is its child, with 6 free axes"):
+        loaded(tmp_path, stage(body("base"), body("arm"), fixed, free))
+
+
+def test_what_a_loop_does_not_have_is_named(tmp_path):
+    drive = "bool physics:excludeFromArticulation = 1\nfloat drive:angular:physics:stiffness = 3\n"
+    closing = joint("k", None, "arm", drive + "float physics:lowerLimit = -3", apis=("PhysicsDriveAPI:angular",))
+    with pytest.raises(spo.UnsupportedError, match="of which one closes a loop"):
+        loaded(tmp_path, stage(body("arm"), joint("j", None, "arm"), closing))
+    parts = body("base"), body("arm"), joint("weld", None, "base", kind="Fixed"), joint("j", "base", "arm")
+    scene, warning = loaded(tmp_path, stage(*parts, closing))
+    assert len(scene.loops) == 1
+    assert "drive:angular:physics:stiffness (/World/k); physics:lowerLimit (/World/k)" in warning

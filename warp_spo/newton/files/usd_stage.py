@@ -140,9 +140,9 @@ def _expectation(name: str, value: Any) -> str:
 def prepare(call: str, stage: Any) -> None:
     """Bring a stage into the form that Newton's importer reads right, in the session layer.
 
-    Actuators of Newton, which may name files, are taken out. Free axes of a joint without a type get limits at
-    infinity, because the importer locks an axis without a limit. A joint whose ``body1`` is nearer to the root than
-    ``body0`` gets them exchanged; its coordinates keep their sign.
+    Actuators of Newton, which may name files, are taken out, and bodies that are not enabled stand still. Free axes of
+    a joint without a type get limits at infinity, because the importer locks an axis without a limit. A joint whose
+    ``body1`` is nearer to the root than ``body0`` gets them exchanged; its coordinates keep their sign.
 
     Raises:
         UnsupportedError: A joint of several degrees of freedom is the wrong way round, or of a body that is not
@@ -162,16 +162,21 @@ def prepare(call: str, stage: Any) -> None:
                     "none for the world"
                 )
         for end in (_end(stage, joint.GetBody0Rel()), _end(stage, joint.GetBody1Rel())):
-            if end and not stage.GetPrimAtPath(end).GetAttribute("physics:rigidBodyEnabled").Get():
+            if end and not _is_enabled(stage.GetPrimAtPath(end)):
                 raise UnsupportedError(
                     call,
                     f"joint {shown(str(joint.GetPath()))!r} of body {shown(end)!r}, which is not enabled,",
                     "write physics:rigidBodyEnabled = true, or physics:jointEnabled = false",
                 )
-    actuators = [prim for prim in all_prims(stage) if prim.GetTypeName() == "NewtonActuator"]
+    prims = list(all_prims(stage))
+    actuators = [prim for prim in prims if prim.GetTypeName() == "NewtonActuator"]
+    still = [prim for prim in prims if prim.HasAPI(UsdPhysics.RigidBodyAPI) and not _is_enabled(prim)]
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         for prim in actuators:
             prim.SetActive(False)
+        for prim in still:
+            _editable(call, prim)
+            prim.RemoveAPI(UsdPhysics.RigidBodyAPI)
         for joint in joints:
             if joint.GetPrim().GetTypeName() == "PhysicsJoint":
                 _free_axes_without_limits(call, joint.GetPrim())
@@ -179,11 +184,15 @@ def prepare(call: str, stage: Any) -> None:
             _exchange_bodies(call, joint)
 
 
+def _is_enabled(prim: Any) -> bool:
+    return bool(prim.GetAttribute("physics:rigidBodyEnabled").Get())
+
+
 def _editable(call: str, prim: Any) -> None:
+    """Raise UnsupportedError if a prim that would have to change is part of an instance."""
     if prim.IsInstanceProxy():
-        raise UnsupportedError(
-            call, f"joint {shown(str(prim.GetPath()))!r} in an instance", "write instanceable = false on the instance"
-        )
+        name = shown(str(prim.GetPath()))
+        raise UnsupportedError(call, f"{name!r} in an instance", "write instanceable = false on the instance")
 
 
 def _free_axes_without_limits(call: str, prim: Any) -> None:

@@ -131,6 +131,12 @@ class ImportedJoints:
                 self.call, f"a joint that slides after one that turns, of {name!r} and the others between its bodies,",
                 "give each a body of its own",
             )  # fmt: skip
+        if any(authored(prim, "physics:excludeFromArticulation") for prim in group):
+            raise UnsupportedError(
+                self.call,
+                f"joint {name!r} beside others between its bodies, of which one closes a loop,",
+                "put an articulation root above the bodies and give the tree a body between",
+            )
         if any(np.abs(_anchor(prim) - _anchor(group[0])).max() > ANCHOR_TOLERANCE for prim in group[1:]):
             raise UnsupportedError(
                 self.call,
