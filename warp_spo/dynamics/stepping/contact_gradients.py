@@ -16,7 +16,7 @@ from ...execution.height_gradients import HeightSums
 from ...execution.routine import Routine, SegmentForm, TuningHints
 from ...recursions.contact.ground import CORNERS, corner_steps
 from ...recursions.contact.points import surface_numbers
-from ...recursions.contact.step import PASSES
+from ...recursions.contact.step import PASSES, by_segments
 from ...recursions.derivatives import contact
 from ...recursions.derivatives.adjoints import result_name
 from ...recursions.derivatives.contact import CAME, COTANGENT, HEIGHTS_AT, INERTIA, SOLVED
@@ -38,17 +38,20 @@ if TYPE_CHECKING:
     from ..dynamics import Dynamics
 
 
-def _divides(scene: Any, inputs: Any, apart: bool, **_: Any) -> bool:
-    return apart
+def _divides(scene: Any, inputs: Any, apart: bool = True, **_: Any) -> bool:
+    return apart and by_segments(scene)
 
 
 PASS = Routine(
-    "contact_pass", contact_pass, segments=SegmentForm(messages="Pzaf", wide=True), hints=TuningHints(crowded=True)
+    "contact_pass",
+    contact_pass,
+    segments=SegmentForm(messages="Pzaf", divides=_divides, wide=True),
+    hints=TuningHints(crowded=True),
 )
 SOLVE = Routine(
     "contact_solve",
     contact.contact_solve,
-    segments=SegmentForm(messages="Pza", wide=True),
+    segments=SegmentForm(messages="Pza", divides=_divides, wide=True),
     hints=TuningHints(crowded=True),
 )
 GRADIENT = Routine(
@@ -58,7 +61,7 @@ GRADIENT = Routine(
     hints=TuningHints(crowded=True),
 )
 WEIGHED = {
-    SOLVE: dataclasses.replace(SOLVE, segments=SegmentForm(messages="PzaQ", wide=True)),
+    SOLVE: dataclasses.replace(SOLVE, segments=SegmentForm(messages="PzaQ", divides=_divides, wide=True)),
     GRADIENT: dataclasses.replace(GRADIENT, segments=SegmentForm(messages="PBGO", divides=_divides, wide=True)),
 }
 """The same where limbs tell each other how inertias count that joints further in feel."""

@@ -8,6 +8,7 @@ velocity terms are evaluated at the midpoint of the last one's step, see
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import warp as wp
@@ -35,8 +36,17 @@ if TYPE_CHECKING:
 MIDPOINT_PASSES = 4  # passes from which on a step uses the midpoint scheme
 ITERATIONS = 2
 UNSETTLED = 0.1  # share of the largest rate by which the final kick may change a rate without a status
+
+
+def _divides(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
+    return contact_step.by_segments(scene)
+
+
 CONTACT_STEP = Routine(
-    "contact_step", contact_step.step, segments=SegmentForm(messages="PzafSE", wide=True), passes=PassForm(counted=True)
+    "contact_step",
+    contact_step.step,
+    segments=SegmentForm(messages="PzafSE", divides=_divides, wide=True),
+    passes=PassForm(counted=True),
 )
 FIRST_KICK = Routine("middle_kick", first_kick, segments=SegmentForm(messages="fPza"))
 FINAL_KICK = Routine("last_kick", final_kick, segments=SegmentForm(messages="fPza"))

@@ -57,7 +57,8 @@ class StepReport(Mapping[str, Any]):
         arrays: arrays by name; None leaves a name out. With substeps all but ``contact_f`` are of the last substep.
 
             * ``qdd``: (qd' - qd) / dt [world, dof], before it is rounded into qd' and before the projection onto the
-              closures. Of the semi-implicit step.
+              closures. Of the semi-implicit step; of a free joint on a body that moves, at the parent's axes of its
+              start.
             * ``poses``, ``velocities``: :meth:`Dynamics.body_poses` [world, body, 7] and
               :meth:`Dynamics.body_velocities` [world, body, 6] of the state after the step. With a warp for each of a
               quadruped's limbs, see :meth:`Dynamics.explain`, one kernel does both.

@@ -39,7 +39,7 @@ from .pairs import (
     velocities_of,
 )
 from .points import TracedContactPoint
-from .step import ContactStepTrace, PointState
+from .step import ContactStepTrace, PointState, by_segments
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace
@@ -91,7 +91,7 @@ def by_limbs(scene: Scene) -> bool:
     """Whether limbs side by side can take a step of a scene with pairs."""
     links = Links(scene)
     segments = Segments(links)
-    return len(segments.leaves) > 1 and seats_of(links, segments) is not None
+    return len(segments.leaves) > 1 and seats_of(links, segments) is not None and by_segments(scene)
 
 
 def team(links: Links, segments: Segments, alpha: int, first: int, warps_of: list[int]) -> Team:

@@ -14,15 +14,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from ...scene.scene import Scene
 from ...status import Status
 from ...trace.emission import Store
 from ...trace.scalars import Value, branch, is_constant, less, reciprocal, select
 from ...trace.spatial import ZERO, Articulated, Twist, Vector, dot, total
 from ..articulated_sweeps import Factors, StepTerms, expand, reduce
-from ..coordinates import integrate_link
 from ..kinematics import zero
 from ..model.links import Link
 from ..newton_euler import inverse_dynamics
+from ..step.descendants import has_free_descendants
 from ..step.joint_laws import Law, add_laws
 from ..step.phases import StepPhases
 from ..step.step import GAIN, Step
@@ -63,6 +64,7 @@ class ContactStepTrace(Step):
             trace.substitutes = {"q": trace.vector(START), "qd": lambda dof: before(dof) + self.kick(dof)}
         super().__init__(trace)
         trace.substitutes.pop("q", None)  # the sweep is at the midpoint, its laws are not
+        self.carries = not self.has_kicks
         self.reports, self.pass_variables = reports, PassVariables(trace.graph)
         self.secant_laws: dict[int, list[SecantLaw]] = {}  # by dof
         self.cull_groups: dict[int, CullGroup] = {}  # by id of the link
@@ -309,11 +311,12 @@ class ContactStepTrace(Step):
         gains = {dof: self._pass_variable(GAIN, dof) for link in self.links for dof in link.dofs}
         rates = {dof: self.qd(dof) + gain for dof, gain in gains.items()}
         stores: list[Store] = []
+        q_after, qd_after = self.state_after(rates)
         for link in self.links:
             trace.label(link, "q")
-            stores += [Store("out", (dof,), rates[dof] + self.kick(dof)) for dof in link.dofs]
-            coordinates = integrate_link(link, self.q, rates.__getitem__, self.h)
-            stores += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(coordinates)]
+            stores += [Store("out", (dof,), qd_after[dof] + self.kick(dof)) for dof in link.dofs]
+            coordinates = range(link.coordinate, link.coordinate + link.hinge.coordinates)
+            stores += [Store("q_out", (c,), q_after[c]) for c in coordinates]
             if qdd:
                 stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
         results = [item.value for item in stores]
@@ -371,6 +374,11 @@ class ContactStepTrace(Step):
         place = ground_offset(self.joint_laws)
         values += [*place.origin, place.field]
         return super()._inputs() + [value for value in values if not is_constant(value)]
+
+
+def by_segments(scene: Scene) -> bool:
+    """Return whether segments can share the work of a step or of its gradients."""
+    return not has_free_descendants(scene)
 
 
 def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> StepPhases:

@@ -22,7 +22,7 @@ from ...trace.scalars import Scalar, Value, ordered
 from ...trace.spatial import ZERO, total
 from ..articulated_sweeps import NO_TERMS, StepTerms, expand, reduce
 from ..composite import mass_matrix
-from ..coordinates import difference, integrate, integrate_link, interpolate
+from ..coordinates import difference, integrate, interpolate
 from ..energy import kinetic_energy, potential_energy
 from ..forward_dynamics import forward_dynamics
 from ..kinematics import body_poses, body_velocities, frame_accelerations, frame_poses, frame_velocities, jacobian
@@ -30,6 +30,7 @@ from ..model.links import Link
 from ..momentum import com, com_velocity
 from ..newton_euler import inverse_dynamics
 from ..step.actuation import actuator_force, build_joint_laws
+from ..step.descendants import state_after
 from .power import Entry, Gradients, Power
 from .tangents import coordinate_directions, tangent_gradient
 
@@ -195,11 +196,9 @@ def step_vjp(trace: Trace, wrt: tuple[str, ...], equations: TreeEquations | None
     links = trace.links.leaders
     dofs = [dof for link in links for dof in link.dofs]
     after = {dof: qd(dof) + h * qdd(dof) for dof in dofs}
-    state = [Store("out", (dof,), rate) for dof, rate in after.items()]
-    for link in links:
-        trace.label(link, "q")
-        values = integrate_link(link, trace.vector("q"), after.__getitem__, h)
-        state += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(values)]
+    q_after, qd_after = state_after(trace, links, trace.vector("q"), qd, after, h)
+    state = [Store("out", (dof,), rate) for dof, rate in qd_after.items()]
+    state += [Store("q_out", (c,), value) for c, value in q_after.items()]
     state = equations.project_state(state)
     seeds = [pushed[item.array == "out"](item.index[0]) for item in state]
     results = [item.value for item in state]

@@ -48,7 +48,6 @@ from ..contact.points import (
     with_ancestors,
 )
 from ..contact.velocity_kicks import KICK, PATH, START
-from ..coordinates import integrate_link
 from ..kinematics import carried_velocity
 from ..model.links import Link
 from ..model.segments import Segment
@@ -165,12 +164,13 @@ class PassAdjoint(OnePass):
         """Return the state after the step and the variables that the pass leaves, and the cotangents of both."""
         trace, results, seeds = self.trace, [], []
         rates = {dof: self.qd(dof) + gain for dof, gain in self.gains.items()}
+        q_after, qd_after = self.state_after(rates)
         for link in self.links:
             trace.label(link, "q")
-            values = integrate_link(link, self.q, rates.__getitem__, self.h)
-            results += [*(rates[dof] + self.kick(dof) for dof in link.dofs), *values]
+            coordinates = range(link.coordinate, link.coordinate + link.hinge.coordinates)
+            results += [*(qd_after[dof] + self.kick(dof) for dof in link.dofs), *(q_after[c] for c in coordinates)]
             seeds += [trace.vector("qd_cotangent")(dof) for dof in link.dofs]
-            seeds += [trace.vector("q_cotangent")(link.coordinate + c) for c in range(len(values))]
+            seeds += [trace.vector("q_cotangent")(c) for c in coordinates]
         seeds = [select(self.last, seed, 0.0) for seed in seeds]
         results += [item.value for item in self.pass_variables.stores]
         return results, seeds + [self._of_later(COTANGENT, self._dofs + x.index[0]) for x in self.pass_variables.stores]

@@ -20,12 +20,12 @@ from ...trace.emission import Store
 from ...trace.scalars import Value, alone, floor, less, reciprocal, select
 from ...trace.spatial import total
 from ..articulated_sweeps import StepTerms, expand, reduce
-from ..coordinates import integrate_link
 from ..kinematics import body_states
 from ..model.links import Link
 from ..model.segments import Segment
 from ..model.tracing import Trace
 from .actuation import build_joint_laws
+from .descendants import has_free_descendants, state_after
 from .joint_laws import Law, add_laws, is_number
 from .joint_space import JointSpace
 from .phases import PhaseBuilder, StepPhases
@@ -57,6 +57,7 @@ class Step:
         vector, given = trace.vector, trace.inputs
         self.h = trace.graph.input("dt", 0)
         apart = "q_from" in given
+        self.carries = not apart
         self.q, self.qd = (vector("q_from"), vector("qd_from")) if apart else (vector("q"), vector("qd"))
         self.joint_laws = build_joint_laws(trace, self.h)
         self.laws: dict[int, list[Law]] = {}  # by dof
@@ -77,11 +78,12 @@ class Step:
             gains = self._solve({dof: self._pass_variable(GAIN, dof) for dof in gains})
         rates_after = {dof: self.qd(dof) + gain for dof, gain in gains.items()}
         stores: list[Store] = []
+        q_after, qd_after = self.state_after(rates_after)
         for link in self.links:
             trace.label(link, "q")
-            stores += [Store("out", (dof,), rates_after[dof]) for dof in link.dofs]
-            coordinates = integrate_link(link, self.q, rates_after.__getitem__, self.h)
-            stores += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(coordinates)]
+            stores += [Store("out", (dof,), qd_after[dof]) for dof in link.dofs]
+            coordinates = range(link.coordinate, link.coordinate + link.hinge.coordinates)
+            stores += [Store("q_out", (c,), q_after[c]) for c in coordinates]
             if qdd:
                 stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
         stores = self.project_state(stores)
@@ -98,6 +100,10 @@ class Step:
         self.phases.add_sweep(self.messages + looped)
         self.phases.add_epilogue(stores)
         return self.phases.phases
+
+    def state_after(self, rates: dict[int, Value]) -> tuple[dict[int, Value], dict[int, Value]]:
+        """Return q' and qd' by entry for ``rates`` = qd + h qdd; at a midpoint the rates stay as they are."""
+        return state_after(self.trace, self.links, self.q, self.qd, rates, self.h, self.carries)
 
     def _accelerations(self, tau: Callable[[int], Value]) -> dict[int, Value]:
         """Return qdd by dof for ``tau``, with the resistances of the active pieces added to Mass."""
@@ -342,8 +348,11 @@ def _entries(segment: Segment) -> list[tuple[str, int]]:
 
 
 def by_segments(scene: Scene) -> bool:
-    """Return whether segments can share the work of a step: sweeps, not a matrix, serve its passes."""
-    return scene.dof_count > MOST_JOINT_SPACE_DOFS
+    """Return whether segments can share the work of a step: sweeps, not a matrix, serve its passes.
+
+    Free bodies on links that move follow from the state of other segments after the step.
+    """
+    return scene.dof_count > MOST_JOINT_SPACE_DOFS and not has_free_descendants(scene)
 
 
 def _isolate(stores: list[Store]) -> list[Store]:

@@ -1,0 +1,143 @@
+"""The state after a step of free bodies on links that move: they keep their inertial velocity.
+
+The rates of a free hinge are relative to its parent and in the parent's axes. Moved by their acceleration at the start
+of the step alone, they miss what the parent turns and speeds up meanwhile: of a body at rest the error is of order dt^2
+a step, in proportion to the parent's speed. So the body moves as a free body without a parent does, v' = v + h a in
+inertial axes and its pose along v'; rates and coordinates follow from the parent's state after the step. A body on
+which nothing acts stays at rest, whatever its parent does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+from ...hinges.quaternions import Quaternion, multiply, quaternion_rotation, rotate_by
+from ...scene.scene import Scene
+from ...trace.scalars import Value
+from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross
+from ..coordinates import integrate_link
+from ..kinematics import NEUTRAL, relative_quaternion
+from ..model.links import Link, place_link
+from ..motion import STILL, hinge_motion, link_motion
+from ..newton_euler import link_acceleration
+
+if TYPE_CHECKING:
+    from ..model.tracing import Trace
+
+Entry = Callable[[int], Value]
+Entries = dict[int, Value]
+
+
+class Moving(NamedTuple):
+    """A link in the inertial frame: its axes, their quaternion, its origin, and (omega; v) in inertial axes."""
+
+    axes: Matrix
+    turn: Quaternion
+    origin: Vector
+    spin: Vector
+    velocity: Vector
+
+    def velocity_at(self, point: Vector) -> Vector:
+        """Return the velocity of the point of the link that is at ``point``."""
+        return self.velocity + cross(self.spin, point - self.origin)
+
+
+GROUND = Moving(IDENTITY, NEUTRAL, ZERO, ZERO, ZERO)
+
+
+def is_free_descendant(link: Link) -> bool:
+    """Return whether a link is free and its parent moves."""
+    return link.hinge.unconstrained and link.parent is not None
+
+
+def has_free_descendants(scene: Scene) -> bool:
+    """Return whether a free hinge of a scene is on a body that moves."""
+    inner = {hinge.child: hinge for hinge in scene.hinges}
+
+    def moves(body: int) -> bool:
+        while body >= 0 and inner[body].dof_count == 0:
+            body = inner[body].parent
+        return body >= 0
+
+    return any(hinge.unconstrained and moves(hinge.parent) for hinge in scene.hinges)
+
+
+def state_after(
+    trace: Trace, links: list[Link], q: Entry, qd: Entry, rates: Entries, h: Value, carries: bool = True
+) -> tuple[Entries, Entries]:
+    """Return q' and qd' by entry, for ``rates`` = qd + h qdd of all dofs.
+
+    Args:
+        links: leaders, parents first. q, qd: the state before the step.
+        carries: free bodies on links that move are carried as said above; otherwise their rates are those given.
+    """
+    q_after, qd_after = Entries(), dict(rates)
+    carried = {id(link) for link in links if carries and is_free_descendant(link)}
+    gains = {dof: rate - qd(dof) for dof, rate in rates.items()} if carried else {}
+    for link in links:
+        trace.label(link, "q")
+        if id(link) in carried:
+            coordinates = _carry(link, q, qd, gains, q_after, qd_after, h)
+        else:
+            coordinates = integrate_link(link, q, rates.__getitem__, h)
+        q_after |= {link.coordinate + c: value for c, value in enumerate(coordinates)}
+    return q_after, qd_after
+
+
+def _carry(
+    link: Link, q: Entry, qd: Entry, gains: Entries, q_after: Entries, qd_after: Entries, h: Value
+) -> list[Value]:
+    """Return the coordinates of a free body after the step; ``qd_after`` receives its rates."""
+    body, spin_gain, velocity_gain = _before(link, q, qd, gains, h)
+    spin, velocity = body.spin + spin_gain, body.velocity + velocity_gain
+    parent_before, parent = _after(link.parent, q, None), _after(link.parent, q_after.__getitem__, qd_after)
+    at_rest = link.hinge.quaternion_at_rest(link)
+    start, end = multiply(parent_before.turn, at_rest), multiply(parent.turn, at_rest)
+    raw = Vector(q(link.coordinate + 3 + c) for c in range(4))
+    quaternion = multiply(Vector((-end[0], -end[1], -end[2], end[3])), rotate_by(multiply(start, raw), spin * h))
+    center = body.origin + velocity * h
+    anchor = parent.axes if link.matrix is None else parent.axes @ link.matrix
+    position = anchor.T @ (center - parent.origin - parent.axes @ link.offset)
+    relative = (anchor.T @ (velocity - parent.velocity_at(center)), anchor.T @ (spin - parent.spin))
+    qd_after |= dict(zip(link.dofs, (*relative[0], *relative[1]), strict=True))
+    return [*(position - quaternion_rotation(*quaternion) @ link.com), *quaternion]
+
+
+def _path(link: Link | None) -> list[Link]:
+    """Return a link and its ancestors, root first."""
+    found: list[Link] = []
+    while link is not None:
+        found.insert(0, link)
+        link = link.parent
+    return found
+
+
+def _after(link: Link | None, q: Entry, qd: Entries | None) -> Moving:
+    """Return a link at a state; ``qd`` None is at rest."""
+    moving = GROUND
+    for each in _path(link):
+        place = place_link(each, q)
+        axes = moving.axes @ place.pose.rotation
+        origin = moving.origin + moving.axes @ place.pose.l
+        turn = multiply(moving.turn, relative_quaternion(each, q))
+        w, v = (ZERO, ZERO) if qd is None else hinge_motion(each, place, qd.__getitem__)
+        moving = Moving(axes, turn, origin, moving.spin + axes @ w, moving.velocity_at(origin) + axes @ v)
+    return moving
+
+
+def _before(link: Link, q: Entry, qd: Entry, gains: Entries, h: Value) -> tuple[Moving, Vector, Vector]:
+    """Return a link at the state before the step, and h times its angular and its linear acceleration."""
+    moving, terms = GROUND, STILL
+    bias, gained = (ZERO, ZERO), (ZERO, ZERO)
+    for each in _path(link):
+        place = place_link(each, q)
+        axes = moving.axes @ place.pose.rotation
+        origin = moving.origin + moving.axes @ place.pose.l
+        w, v = hinge_motion(each, place, qd)
+        moving = Moving(axes, NEUTRAL, origin, moving.spin + axes @ w, moving.velocity_at(origin) + axes @ v)
+        terms = link_motion(each, place, terms if each.parent is not None else None, qd)
+        bias = link_acceleration(each, place, terms, bias, lambda dof: 0.0)
+        gained = link_acceleration(each, place, STILL, gained, gains.__getitem__)
+    spin, velocity = (moving.axes @ (x * h + y) for x, y in zip(bias, gained, strict=True))
+    return moving, spin, velocity
