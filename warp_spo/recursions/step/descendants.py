@@ -29,7 +29,7 @@ Entry = Callable[[int], Value]
 Entries = dict[int, Value]
 
 
-class Moving(NamedTuple):
+class InertialLink(NamedTuple):
     """A link in the inertial frame: its axes, their quaternion, its origin, and (omega; v) in inertial axes."""
 
     axes: Matrix
@@ -43,7 +43,7 @@ class Moving(NamedTuple):
         return self.velocity + cross(self.spin, point - self.origin)
 
 
-GROUND = Moving(IDENTITY, NEUTRAL, ZERO, ZERO, ZERO)
+GROUND = InertialLink(IDENTITY, NEUTRAL, ZERO, ZERO, ZERO)
 
 
 def is_free_descendant(link: Link) -> bool:
@@ -113,7 +113,7 @@ def _path(link: Link | None) -> list[Link]:
     return found
 
 
-def _after(link: Link | None, q: Entry, qd: Entries | None) -> Moving:
+def _after(link: Link | None, q: Entry, qd: Entries | None) -> InertialLink:
     """Return a link at a state; ``qd`` None is at rest."""
     moving = GROUND
     for each in _path(link):
@@ -122,11 +122,11 @@ def _after(link: Link | None, q: Entry, qd: Entries | None) -> Moving:
         origin = moving.origin + moving.axes @ place.pose.l
         turn = multiply(moving.turn, relative_quaternion(each, q))
         w, v = (ZERO, ZERO) if qd is None else hinge_motion(each, place, qd.__getitem__)
-        moving = Moving(axes, turn, origin, moving.spin + axes @ w, moving.velocity_at(origin) + axes @ v)
+        moving = InertialLink(axes, turn, origin, moving.spin + axes @ w, moving.velocity_at(origin) + axes @ v)
     return moving
 
 
-def _before(link: Link, q: Entry, qd: Entry, gains: Entries, h: Value) -> tuple[Moving, Vector, Vector]:
+def _before(link: Link, q: Entry, qd: Entry, gains: Entries, h: Value) -> tuple[InertialLink, Vector, Vector]:
     """Return a link at the state before the step, and h times its angular and its linear acceleration."""
     moving, terms = GROUND, STILL
     bias, gained = (ZERO, ZERO), (ZERO, ZERO)
@@ -135,7 +135,7 @@ def _before(link: Link, q: Entry, qd: Entry, gains: Entries, h: Value) -> tuple[
         axes = moving.axes @ place.pose.rotation
         origin = moving.origin + moving.axes @ place.pose.l
         w, v = hinge_motion(each, place, qd)
-        moving = Moving(axes, NEUTRAL, origin, moving.spin + axes @ w, moving.velocity_at(origin) + axes @ v)
+        moving = InertialLink(axes, NEUTRAL, origin, moving.spin + axes @ w, moving.velocity_at(origin) + axes @ v)
         terms = link_motion(each, place, terms if each.parent is not None else None, qd)
         bias = link_acceleration(each, place, terms, bias, lambda dof: 0.0)
         gained = link_acceleration(each, place, STILL, gained, gains.__getitem__)
