@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ..trace.scalars import Value, is_constant, reciprocal, sqrt
+from ..trace.scalars import Entry, Value, is_constant, reciprocal, sqrt
 from ..trace.spatial import ZERO, Matrix, Pose, Twist, Vector, cross, dot
-from .hinge_type import BALL, Carrier, Entry, HingeType, LinkPlacement
+from .hinge_type import BALL, Carrier, HingeType, LinkPlacement
 from .quaternions import Quaternion, multiply, quaternion_rotation, rotate_by, rotation_vector
 
 

@@ -17,9 +17,9 @@ import numpy as np
 
 from ..trace.differentiation import forward
 from ..trace.functions import AbstractScalar
-from ..trace.scalars import Graph, Value, cut, is_constant
+from ..trace.scalars import Entry, Graph, Value, cut, is_constant
 from ..trace.spatial import ZERO, Matrix, Pose, Twist, Vector, dot
-from .hinge_type import Carrier, Entry, HingeType, LinkPlacement
+from .hinge_type import Carrier, HingeType, LinkPlacement
 from .quaternions import Quaternion, matrix_quaternion, multiply
 
 MOST = 6

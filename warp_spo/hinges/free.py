@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..trace.scalars import Value
+from ..trace.scalars import Entry, Value
 from ..trace.spatial import ZERO, Matrix, Twist, Vector, cross
 from .ball import Ball, hinge_rotation, inverse_hinge_rotation
-from .hinge_type import FREE, Carrier, Entry, LinkPlacement
+from .hinge_type import FREE, Carrier, LinkPlacement
 from .quaternions import quaternion_rotation
 
 

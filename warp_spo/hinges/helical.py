@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ..trace.scalars import Value, cos, reduced, sin
+from ..trace.scalars import Entry, Value, cos, reduced, sin
 from ..trace.spatial import IDENTITY, Matrix, Pose, Twist, Vector, cross
-from .hinge_type import SCREWS, Carrier, Entry, HingeType, LinkPlacement
+from .hinge_type import SCREWS, Carrier, HingeType, LinkPlacement
 from .quaternions import Quaternion
 from .revolute import rotate_about_z
 

@@ -7,18 +7,17 @@ axes are named. Entries of q and qd are asked for by index: ``q(i)``, ``rate(dof
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ..trace.scalars import Value
+from ..trace.scalars import Entry, Value
 from ..trace.spatial import ZERO, Matrix, Pose, Rigid, Twist, Vector, cross
 from .quaternions import Quaternion, constant_quaternion
 
 SCREWS, BALL, FREE = range(3)  # how work at node granularity places a node
 STILL = (ZERO, ZERO)
-Entry = Callable[[int], Value]
 
 
 class Carrier(Protocol):

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ..trace.scalars import Value
+from ..trace.scalars import Entry, Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Twist, Vector, symmetric
-from .hinge_type import SCREWS, Carrier, Entry, HingeType, LinkPlacement
+from .hinge_type import SCREWS, Carrier, HingeType, LinkPlacement
 from .quaternions import Quaternion
 
 Z = IDENTITY[2]

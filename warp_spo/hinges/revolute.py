@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ..trace.scalars import Value, cos, sin
+from ..trace.scalars import Entry, Value, cos, sin
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Twist, Vector, cross, symmetric
-from .hinge_type import SCREWS, Carrier, Entry, HingeType, LinkPlacement
+from .hinge_type import SCREWS, Carrier, HingeType, LinkPlacement
 from .quaternions import Quaternion, multiply
 
 Z = IDENTITY[2]

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 
-from ..trace.scalars import Value
+from ..trace.scalars import Entry, Value
 from ..trace.spatial import ZERO, Matrix, Pose, Rigid, Twist, Vector, cross
-from .hinge_type import Carrier, Entry, HingeType, LinkPlacement
+from .hinge_type import Carrier, HingeType, LinkPlacement
 from .quaternions import Quaternion
 from .revolute import Revolute, Z
 

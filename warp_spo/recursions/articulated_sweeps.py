@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from ..trace.emission import Store
-from ..trace.scalars import Value, is_constant
+from ..trace.scalars import Entry, Value, is_constant
 from ..trace.spatial import ZERO, Articulated, Pose, Twist, Vector, total
 from . import articulated
 from .articulated import HERE, NO_INERTIA
@@ -109,7 +109,7 @@ def inside(trace: Trace, child: Link, done: dict) -> tuple[Pose, Articulated]:
 
 def reduce(
     trace: Trace,
-    tau: Callable[[int], Value],
+    tau: Entry,
     moves: bool,
     loads: bool,
     letters: str = "Pz",

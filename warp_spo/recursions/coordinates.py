@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ..trace.emission import Store
-from ..trace.scalars import Value
+from ..trace.scalars import Entry, Value
 from .model.links import Link
 
 if TYPE_CHECKING:
@@ -50,12 +50,12 @@ def _coordinates(trace: Trace, of: Callable[[Link], list[Value]]) -> list[Store]
     return stores
 
 
-def integrate_link(link: Link, q: Callable[[int], Value], rate: Callable[[int], Value], h: Value) -> list[Value]:
+def integrate_link(link: Link, q: Entry, rate: Entry, h: Value) -> list[Value]:
     """Return the link's coordinates after ``rate(dof)`` has been constant for ``h`` [s]; quaternions come out
     normalised."""
     return link.hinge.integrate(link, q, [rate(dof) for dof in link.dofs], h)
 
 
-def rates_of_link(link: Link, q: Callable[[int], Value], rate: Callable[[int], Value]) -> list[Value]:
+def rates_of_link(link: Link, q: Entry, rate: Entry) -> list[Value]:
     """Return the time derivatives of the link's coordinates; of a quaternion, of the unit one."""
     return link.hinge.coordinate_rates(link, q, [rate(dof) for dof in link.dofs])

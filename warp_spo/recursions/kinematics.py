@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from ..hinges.quaternions import Quaternion, constant_quaternion, multiply, turned
 from ..trace.emission import Store
-from ..trace.scalars import Value, constant_of
+from ..trace.scalars import Entry, Value, constant_of
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Twist, Vector, cross, dot
 from .model.links import Link, LinkPlacement, Links, place_link
 from .motion import hinge_motion
@@ -220,7 +219,7 @@ def place_all(trace: Trace, moves: bool = False) -> dict[int, Vector]:
     return origins
 
 
-def link_accelerations(trace: Trace, qdd: Callable[[int], Value]) -> dict[int, Twist]:
+def link_accelerations(trace: Trace, qdd: Entry) -> dict[int, Twist]:
     """Return the accelerations of the links without gravity: phi* (H* qdd + a)."""
     alpha: dict[int, Twist] = {}
     for link in trace.links.links:

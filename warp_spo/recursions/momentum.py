@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ..trace.emission import Store, merge
-from ..trace.scalars import Value, reciprocal
+from ..trace.scalars import Entry, Value, reciprocal
 from ..trace.spatial import ZERO, Rigid, Vector, Wrench, cross
 from . import articulated, composite, newton_euler
 from .kinematics import link_accelerations, link_velocities, place_all, zero
@@ -101,7 +100,7 @@ def centroidal_momentum_matrix(trace: Trace) -> list[Store]:
     return merge(stores) if trace.links.shares_dofs else stores
 
 
-def centroidal_momentum_bias(trace: Trace, qdd: Callable[[int], Value] = zero) -> list[Store]:
+def centroidal_momentum_bias(trace: Trace, qdd: Entry = zero) -> list[Store]:
     """out [6] = A qdd + A' qd: the force and the moment about the CoM that the motion takes, without gravity"""
     origins = place_all(trace, moves=True)
     alpha, bodies = link_accelerations(trace, qdd), composite_inertias(trace)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from ..trace.emission import Store
-from ..trace.scalars import Value
+from ..trace.scalars import Entry, Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Rigid, Twist, Vector, Wrench, cross, skew
 from .model.links import Link, LinkPlacement
 from .motion import VelocityTerms, armature_forces, carry_acceleration, hinge_entries, hinge_motion
@@ -89,7 +88,7 @@ def root_force(
 
 
 def inverse_dynamics(
-    trace: Trace, gravity: bool = True, qdd: Callable[[int], Value] | None = None, letter: str = "z", moves: bool = True
+    trace: Trace, gravity: bool = True, qdd: Entry | None = None, letter: str = "z", moves: bool = True
 ) -> list[Store]:
     """out = Mass qdd + bias_force, for ``qdd`` or the array of that name; without velocity terms if not ``moves``"""
     base = trace.base_acceleration if gravity else (ZERO, ZERO)

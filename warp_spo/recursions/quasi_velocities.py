@@ -6,12 +6,11 @@ the forces, over sqrt(D). C does no work, nu . C = 0. Jain, Rodriguez 1995, "Dia
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from ..trace.differentiation import forward
 from ..trace.emission import Store
-from ..trace.scalars import Value, is_constant, ordered, sqrt
+from ..trace.scalars import Entry, Value, is_constant, ordered, sqrt
 from ..trace.spatial import ZERO, Articulated, Twist, Vector, dot, total
 from . import articulated, hybrid
 from .articulated_sweeps import Factors, eliminate
@@ -22,8 +21,6 @@ from .motion import carry_acceleration, link_motion
 if TYPE_CHECKING:
     from .model.links import Link, LinkPlacement
     from .model.tracing import Trace
-
-Entry = Callable[[int], Value]
 
 
 def factor_by_dofs(trace: Trace) -> Factors:

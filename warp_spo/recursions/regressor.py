@@ -11,11 +11,11 @@ Atkeson, An, Hollerbach 1986.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..trace.emission import Store
-from ..trace.scalars import Value
+from ..trace.scalars import Entry, Value
 from ..trace.spatial import IDENTITY, ZERO, Matrix, Pose, Rigid, Twist, Vector, cross, dot, skew, symmetric
 from .kinematics import carried_velocity
 from .model.links import Link
@@ -124,7 +124,7 @@ def carried_columns(trace: Trace, link: Link, columns: dict[int, dict[int, Twist
     return found | dict(zip(link.dofs, link.hinge.columns(place), strict=True))
 
 
-def carried_rates(trace: Trace, link: Link, velocities: dict[int, Twist], rate: Callable[[int], Value]) -> Twist:
+def carried_rates(trace: Trace, link: Link, velocities: dict[int, Twist], rate: Entry) -> Twist:
     """Return (omega; v) of a link's frame at the rates ``rate(dof)``."""
     above = (ZERO, ZERO)
     if link.parent is not None:

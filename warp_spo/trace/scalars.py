@@ -22,6 +22,7 @@ FUNCTIONS = {
 BRANCHES = ("branch", "fork", "either")  # operations of :func:`branch`
 
 Value = Any  # a Scalar, or a float, which is a constant
+Entry = Callable[[int], Value]  # an array, by the index of an entry
 
 
 class Graph:

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 from ...trace.emission import Store
-from ...trace.scalars import Value, branch, guarded, reciprocal
+from ...trace.scalars import Entry, Value, branch, guarded, reciprocal
 from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Pose, Twist, Vector, cross, dot, total
 from .. import articulated
 from ..articulated import NO_INERTIA
@@ -269,12 +269,7 @@ def force_to_parent(pose: Pose, z: Vector) -> Vector:
 
 
 def reduce(
-    trace: Trace,
-    plan: TiePlan,
-    nodes: dict[int, Node],
-    terms: StepTerms,
-    tau: Callable[[int], Value],
-    phases: PhaseBuilder,
+    trace: Trace, plan: TiePlan, nodes: dict[int, Node], terms: StepTerms, tau: Entry, phases: PhaseBuilder
 ) -> tuple[Factors, dict]:
     """Sweep inward; ``nodes`` by id of the first link of each aggregate. Return factors and D^-1 eps, by link."""
     done: Factors = {}

@@ -6,11 +6,10 @@ Before the first pass and after each one, native code finds dampers and loads of
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ...trace.emission import Store
-from ...trace.scalars import Value
+from ...trace.scalars import Entry, Value
 from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Twist, Vector, cross, total
 from .. import articulated
 from ..articulated_sweeps import Factors, StepTerms
@@ -60,7 +59,7 @@ class CoupledStep(ContactStepTrace):
             prologue=found.prologue + self.first, sweep=found.sweep + self.twists, epilogue=found.epilogue + reported
         )
 
-    def inward(self, terms: StepTerms, tau: Callable[[int], Value]) -> tuple[Factors, dict, list[Store]]:
+    def inward(self, terms: StepTerms, tau: Entry) -> tuple[Factors, dict, list[Store]]:
         """Return factors and D^-1 eps of a pass by link, for forces of the dofs; no stores that send."""
         return *aggregates.reduce(self.trace, self.plan, self.nodes, terms, tau, self.phases), []
 

@@ -7,14 +7,14 @@ sweep then adds A0^-1 J* times the wrenches to x0. :mod:`warp_spo.reference.body
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ...scene.scene import Scene
 from ...trace.emission import Store
-from ...trace.scalars import Value, sqrt
+from ...trace.scalars import Entry, Value, sqrt
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Twist, Vector, cross, total
 from ..articulated_sweeps import NO_FORCE, pivots, propagate_inward, weighted_products
 from ..kinematics import carried_velocity, frame_on_link, velocity
@@ -87,7 +87,7 @@ def place_axes_of(trace: Trace, links: list[Link | None]) -> None:
             trace.axes[id(link)] = turn if link.parent is None else trace.axes[id(link.parent)] @ turn
 
 
-def velocities_of(trace: Trace, links: list[Link | None], qd: Callable[[int], Value]) -> dict[int | None, Twist]:
+def velocities_of(trace: Trace, links: list[Link | None], qd: Entry) -> dict[int | None, Twist]:
     """Return (omega; v) of links, and of those that carry them, in their axes by id."""
     needed = with_ancestors(links)
     found: dict[int | None, Twist] = {None: (ZERO, ZERO)}

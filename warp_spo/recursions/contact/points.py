@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from ...scene.contacts import ContactPoint
 from ...scene.ground import AWAY, HEIGHTS, PLACE, HeightField, Listed
 from ...scene.scene import Scene
-from ...trace.scalars import Value, absolute, branch, is_constant, less, lost, reciprocal, select
+from ...trace.scalars import Entry, Value, absolute, branch, is_constant, less, lost, reciprocal, select
 from ...trace.spatial import IDENTITY, ZERO, Twist, Vector, cross, dot, total
 from ..kinematics import arm_on_link, carried_velocity, frame_on_link, zero
 from ..model import effective_mass
@@ -137,7 +137,7 @@ class ContactLinkMotion(NamedTuple):
 def place_points(
     trace: Trace,
     joint_laws: JointLaws,
-    qd: Callable[[int], Value],
+    qd: Entry,
     oriented: bool = False,
     branches: bool = False,
     carry: Callable[[Link, ContactLinkMotion], ContactLinkMotion] | None = None,
@@ -202,8 +202,8 @@ def _carry_outward(
     trace: Trace,
     base: ContactLinkMotion,
     needed: set[int],
-    qd: Callable[[int], Value],
-    path: Callable[[int], Value],
+    qd: Entry,
+    path: Entry,
     carry: Callable[[Link, ContactLinkMotion], ContactLinkMotion] | None,
 ) -> dict[int | None, ContactLinkMotion]:
     """Return what the ``needed`` links carry, by id, from the ``base`` outward; what the base carries is under None.

@@ -11,13 +11,12 @@ ground; the last of three or more opens none. :mod:`warp_spo.reference.contact` 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ...scene.scene import Scene
 from ...status import Status
 from ...trace.emission import Store
-from ...trace.scalars import Value, branch, is_constant, less, reciprocal, select
+from ...trace.scalars import Entry, Value, branch, is_constant, less, reciprocal, select
 from ...trace.spatial import ZERO, Articulated, Twist, Vector, dot, total
 from ..articulated_sweeps import Factors, StepTerms, expand, reduce
 from ..kinematics import zero
@@ -146,7 +145,7 @@ class ContactStepTrace(Step):
         bias = {item.index[0]: item.value for item in found if item.array == "out"}
         return bias, [item for item in found if item.array != "out"]
 
-    def inward(self, terms: StepTerms, tau: Callable[[int], Value]) -> tuple[Factors, dict, list[Store]]:
+    def inward(self, terms: StepTerms, tau: Entry) -> tuple[Factors, dict, list[Store]]:
         """Return factors and D^-1 eps of a pass by link, for forces of the dofs, and the stores that send."""
         return reduce(self.trace, tau, moves=False, loads=False, phases=self.phases, terms=terms)
 

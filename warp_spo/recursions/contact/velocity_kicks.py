@@ -25,7 +25,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ...trace.emission import Store
-from ...trace.scalars import Value, reciprocal
+from ...trace.scalars import Entry, Value, reciprocal
 from ...trace.spatial import ZERO
 from ..articulated_sweeps import expand, reduce
 from ..coordinates import integrate_link
@@ -71,7 +71,7 @@ def final_kick(trace: Trace, qdd: bool = False) -> list[Store]:
     return stores
 
 
-def _rates_and_kicks(trace: Trace) -> tuple[Callable[[int], Value], ...]:
+def _rates_and_kicks(trace: Trace) -> tuple[Entry, ...]:
     """Return entries of qd, and of qd' and k of the previous iteration."""
     return tuple(map(trace.vector, ("qd", PREVIOUS_RATES, PREVIOUS_KICK)))
 

@@ -18,7 +18,7 @@ from ...scene.contact_values import CONTACT_VALUES
 from ...scene.ground import GROUND_VALUES
 from ...trace.differentiation import forward, reverse
 from ...trace.emission import Store
-from ...trace.scalars import Scalar, Value, ordered
+from ...trace.scalars import Entry, Scalar, Value, ordered
 from ...trace.spatial import ZERO, total
 from ..articulated_sweeps import NO_TERMS, StepTerms, expand, reduce
 from ..composite import mass_matrix
@@ -31,7 +31,7 @@ from ..momentum import com, com_velocity
 from ..newton_euler import inverse_dynamics
 from ..step.actuation import actuator_force, build_joint_laws
 from ..step.descendants import state_after
-from .power import Entry, Gradients, Power
+from .power import Gradients, Power
 from .tangents import coordinate_directions, tangent_gradient
 
 if TYPE_CHECKING:

@@ -35,7 +35,7 @@ from ...scene.ground import HEIGHTS
 from ...scene.parts import DOF_VALUES
 from ...trace.differentiation import reverse
 from ...trace.emission import Store
-from ...trace.scalars import Scalar, Value, cut, is_constant, less, ordered, select
+from ...trace.scalars import Entry, Scalar, Value, cut, is_constant, less, ordered, select
 from ...trace.spatial import ZERO, Articulated, Twist, Vector, dot, total
 from ..articulated_sweeps import NO_TERMS, Factors, eliminate, expand, reduce
 from ..contact.ground import CORNERS
@@ -54,7 +54,7 @@ from ..model.segments import Segment
 from ..motion import hinge_motion, whirl
 from .adjoints import entries, result_name
 from .contact_pass import NUMBER, OnePass
-from .power import Entry, Gradients, Power
+from .power import Gradients, Power
 
 if TYPE_CHECKING:
     from ...scene.scene import Scene

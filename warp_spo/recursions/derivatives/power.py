@@ -8,12 +8,12 @@ each link; the gradient by mu is the force that the link transmits.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 from ...trace.differentiation import reverse
 from ...trace.emission import Store
-from ...trace.scalars import Value, cut, is_constant, ordered
+from ...trace.scalars import Entry, Value, cut, is_constant, ordered
 from ...trace.spatial import ZERO, Matrix, Rigid, Twist, Vector, cross, dot, skew
 from ..model.links import Link, LinkPlacement
 from ..motion import armature_forces, hinge_motion, own_bias, whirl
@@ -21,7 +21,6 @@ from ..motion import armature_forces, hinge_motion, own_bias, whirl
 if TYPE_CHECKING:
     from ..model.tracing import Trace
 
-Entry = Callable[[int], Value]
 Gradients = dict[tuple, Value]
 """Gradient of the sum, by name and index of an input of the trace."""
 

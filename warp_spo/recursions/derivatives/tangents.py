@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ...trace.scalars import Value
-from .power import Entry
+from ...trace.scalars import Entry, Value
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace

@@ -11,12 +11,11 @@ between two launches. Passes of a loop cannot span several launches, so that lim
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ...errors import UnsupportedError
 from ...trace.emission import Store
-from ...trace.scalars import Value, less, select
+from ...trace.scalars import Entry, Value, less, select
 from ...trace.spatial import total
 from ..articulated_sweeps import StepTerms, expand, reduce
 from ..coordinates import integrate_link
@@ -52,7 +51,7 @@ class ClosedStep(Step):
         self.rates: list[Value] = []  # after the step, before the projection
         self.after: tuple[Columns, Columns] = {}, {}  # q', qd'
 
-    def _accelerations(self, tau: Callable[[int], Value]) -> Columns:
+    def _accelerations(self, tau: Entry) -> Columns:
         swept = self.loops.sweep(tau, moves=True, loads=True, terms=StepTerms(self._with_resistance))
         self.margins += swept.margins
         return self.loops.outward_accelerations(swept, self.trace.base_acceleration)
@@ -119,7 +118,7 @@ class MultiplierStep(Step):
                 raise UnsupportedError("Dynamics.step", what, "use loops='embed'")
         return stiff
 
-    def _accelerations(self, tau: Callable[[int], Value]) -> Columns:
+    def _accelerations(self, tau: Entry) -> Columns:
         trace, terms = self.trace, StepTerms(self._with_resistance)
         place_links(trace, moves=True)
         loads = combine_rows(trace, trace.vector("multipliers"))

@@ -9,7 +9,7 @@ vectors are in the axes of that lowest link.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from ...errors import UnsupportedError
 from ...scene.parts import Coupling, Loop, in_plane
 from ...scene.scene import Scene
 from ...trace.evaluation import evaluate
-from ...trace.scalars import Value, less, reciprocal
+from ...trace.scalars import Entry, Value, less, reciprocal
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, dot, total
 from .. import articulated
 from ..model.links import BodyPlacement, Link, LinkPlacement, Links, place_link
@@ -73,7 +73,7 @@ class CouplingConstraint:
 
     rows = 1
 
-    def error(self, places: Any, q: Callable[[int], Value]) -> list[Value]:
+    def error(self, places: Any, q: Entry) -> list[Value]:
         return [q(self.follower.coordinate) - self.ratio * q(self.leader.coordinate) - self.offset]
 
     def jacobian(self, places: Any) -> list[dict[int, Value]]:
@@ -82,7 +82,7 @@ class CouplingConstraint:
     def sizes(self, places: Any) -> list[Value]:
         return [1.0 + self.ratio * self.ratio]
 
-    def acceleration(self, places: Any, qd: Any, qdd: Callable[[int], Value]) -> list[Value]:
+    def acceleration(self, places: Any, qd: Any, qdd: Entry) -> list[Value]:
         return [qdd(self.follower.dofs[0]) - self.ratio * qdd(self.leader.dofs[0])]
 
 
@@ -178,7 +178,7 @@ class Closure:
                     w, v = state.axes @ Vector(H[:3]), state.axes @ Vector(H[3:])
                     yield dof, w * sign, (v + cross(w, arm)) * sign, arm
 
-    def acceleration(self, places: dict[int, LinkPlacement], qd: Any, qdd: Callable[[int], Value]) -> list[Value]:
+    def acceleration(self, places: dict[int, LinkPlacement], qd: Any, qdd: Entry) -> list[Value]:
         """Return Y qdd + Y' qd; ``qd`` None is zero."""
         inner, outer = self._anchors(places, qd, qdd)
         w, v = outer.spin - inner.spin, outer.velocity - inner.velocity
@@ -334,10 +334,7 @@ def one_world(scene: Scene) -> Scene:
 
 
 def count_open_rows(
-    constraints: list[Closure | CouplingConstraint],
-    places: dict[int, LinkPlacement],
-    q: Callable[[int], Value],
-    qd: Callable[[int], Value],
+    constraints: list[Closure | CouplingConstraint], places: dict[int, LinkPlacement], q: Entry, qd: Entry
 ) -> Value:
     """Return how many rows are open by more than OPEN: in g relative to its size, or in Y qd relative to the rates."""
     found = []

@@ -19,7 +19,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from ...trace.scalars import Value, absolute, guarded, reciprocal, sqrt
+from ...trace.scalars import Entry, Value, absolute, guarded, reciprocal, sqrt
 from ...trace.spatial import ZERO, Articulated, Twist, Vector, dot, total
 from .. import articulated, newton_euler
 from ..articulated import NO_INERTIA
@@ -95,9 +95,7 @@ class ClusterConstraints:
     rows: list[Columns]
     numbers: list[int]  # of the rows, within the cluster
 
-    def accelerations(
-        self, places: dict[int, LinkPlacement], qd: Any, qdd: Callable[[int], Value] = lambda dof: 0.0
-    ) -> list[Value]:
+    def accelerations(self, places: dict[int, LinkPlacement], qd: Any, qdd: Entry = lambda dof: 0.0) -> list[Value]:
         """Return Y qdd + Y' qd."""
         values = [value for _, c in self.cluster.constraints for value in c.acceleration(places, qd, qdd)]
         return [values[i] for i in self.numbers]

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 from ...trace.emission import Store
-from ...trace.scalars import Value
+from ...trace.scalars import Entry, Value
 from ...trace.spatial import Articulated, Twist, Vector, total
 from .. import articulated, newton_euler
 from ..articulated import HERE, NO_INERTIA
@@ -99,7 +99,7 @@ class ClosedLoops:
 
     def sweep(
         self,
-        tau: Callable[[int], Value],
+        tau: Entry,
         moves: bool,
         loads: bool,
         wrenches: dict[int, Vector] | None = None,

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING
 
 from ...trace.differentiation import reverse
 from ...trace.emission import Store
-from ...trace.scalars import Scalar, Value, cut, is_constant, ordered
+from ...trace.scalars import Entry, Scalar, Value, cut, is_constant, ordered
 from ...trace.spatial import ZERO, total
 from .. import newton_euler
 from ..articulated_sweeps import NO_TERMS, StepTerms
 from ..derivatives import adjoints
 from ..derivatives.adjoints import TreeEquations, gradient_stores, rates_along
-from ..derivatives.power import Entry, Gradients, Power
+from ..derivatives.power import Gradients, Power
 from .closed_step import ClosedStep
 from .clusters import Cluster, Columns
 from .embedded import ClosedLoops, Embedding

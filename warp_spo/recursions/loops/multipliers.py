@@ -6,11 +6,10 @@ tau + Y* lambda. Y touches only what lies between a loop's ends; loops may span 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from ...trace.emission import Store
-from ...trace.scalars import Value
+from ...trace.scalars import Entry, Value
 from ...trace.spatial import ZERO, Vector, total
 from .. import articulated
 from ..articulated_sweeps import NO_TERMS, StepTerms, expand, mirror, pivots, reduce, weighted_products
@@ -30,7 +29,7 @@ def constraint_rows(trace: Trace) -> list[Columns]:
     return [{dof: x for dof, x in row.items() if not (x.__class__ is float and x == 0.0)} for row in found]
 
 
-def loop_system(trace: Trace, tau: Callable[[int], Value] | None = None, terms: StepTerms = NO_TERMS) -> list[Store]:
+def loop_system(trace: Trace, tau: Entry | None = None, terms: StepTerms = NO_TERMS) -> list[Store]:
     """out [row, row] = Y Mass^-1 Y*; right [row] = Y qdd(0) + Y' qd; size [row]; for ``tau`` or the array"""
     moves = "qd" in trace.inputs
     done, rates, _ = reduce(trace, tau or trace.vector("tau"), moves, loads=True, terms=terms)

@@ -8,10 +8,9 @@ where the remainder is rounding alone the rows are dependent, and results become
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
-from ...trace.scalars import Value, absolute, guarded, is_constant, reciprocal, select, sqrt
+from ...trace.scalars import Entry, Value, absolute, guarded, is_constant, reciprocal, select, sqrt
 from ...trace.spatial import total
 from ..articulated import zero_or_nan
 
@@ -101,7 +100,7 @@ class NullSpace:
             found[pivot] = (right[row] - known) * inverse
         return self._reflect_back(found)
 
-    def multipliers(self, force: Callable[[int], Value]) -> list[Value]:
+    def multipliers(self, force: Entry) -> list[Value]:
         """Return mu, by row, with Y* mu = the part of a ``force``, by column, that X* maps to zero."""
         x = {column: force(column) for column in self._columns}
         for _, _, _, reflection in self._steps:

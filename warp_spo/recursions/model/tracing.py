@@ -7,11 +7,11 @@ link and which letter of the paper a value belongs to.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from ...trace.emission import Store
-from ...trace.scalars import Value
+from ...trace.scalars import Entry, Value
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Twist, Vector, cross
 from .. import motion, newton_euler
 from ..motion import STILL, VelocityTerms
@@ -44,7 +44,7 @@ class Trace:
     def __init__(self, links: Links, dtype: str, inputs: tuple[str, ...], exchange: Exchange | None = None):
         self.links, self.graph, self.epsilon, self.inputs = links, links.graph, EPSILON[dtype], inputs
         self.exchange = WholeTree(links) if exchange is None else exchange
-        self.substitutes: dict[str, Callable[[int], Value]] = {}
+        self.substitutes: dict[str, Entry] = {}
         self.team: Any = None
         self.couples: list[tuple[int, list[Store]]] = []
         self.kept_between_sweeps: list[Value] = []
@@ -59,7 +59,7 @@ class Trace:
                 self.bodies.setdefault(id(link), []).append(body)
 
     # -- inputs ----------------------------------------------------------------------------------------------------
-    def vector(self, name: str) -> Callable[[int], Value]:
+    def vector(self, name: str) -> Entry:
         """Return ``entry(i)`` of an array; zero if the array is not among the inputs."""
         if name in self.substitutes:
             return self.substitutes[name]
@@ -67,7 +67,7 @@ class Trace:
             return lambda i: 0.0
         return lambda i: self.graph.input(name, i)
 
-    def at(self, state: Mapping[str, Callable[[int], Value]]) -> Trace:
+    def at(self, state: Mapping[str, Entry]) -> Trace:
         """Return a trace of the same links at another ``state``: functions of entries of "q" and "qd", no forces."""
         other = copy.copy(self)
         other.inputs, other.substitutes, other.compensates_gravity = tuple(state), dict(state), False
