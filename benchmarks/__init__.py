@@ -11,7 +11,8 @@ One question each, on a GPU:
     step), ``actuators``, ``flexible``, ``capabilities`` (other solvers), ``host_time``, ``jax_check``, ``many_gpus``.
 Accuracy, mostly on a CPU:
     ``stress/``, ``stability`` (robots under gravity), ``frames`` (where frames lie), ``gradients`` (rollouts),
-    ``robot_files`` and ``mjcf_files`` (readers), ``inverse_kinematics``, ``flexible_peers`` and ``boom`` (beams).
+    ``robot_files`` and ``mjcf_files`` (readers), ``fuzz`` (damaged files), ``inverse_kinematics``,
+    ``flexible_peers`` and ``boom`` (beams).
 Contact:
     ``contact/``: times and errors, energy, every promised figure, other engines, gradients, terrain.
 Learning:

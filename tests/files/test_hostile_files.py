@@ -137,6 +137,7 @@ HOSTILE = {
     "a model of others": mjcf(limb(), top='<asset><model name="x" file="/etc/passwd"/></asset>'),
     "a mesh of others": shaped("/etc/passwd"),
     "a device for a mesh": shaped("/dev/zero"),
+    "a format for printf": mjcf('<body><joint class="%s%n"/><geom size=".1"/></body>'),
     "a joint tied to itself": mjcf(limb(), EQUALITY.format('<joint joint1="a" joint2="a"/>')),
     "a number of a megabyte": mjcf(limb(mass="9" * 1_000_000)),
     "an infinite mass": mjcf(limb(mass="inf")),

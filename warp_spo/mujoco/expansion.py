@@ -1,7 +1,8 @@
 """What an MJCF file expands to, looked at before MuJoCo does it.
 
 A short file may ask for billions of elements, or attach itself without end; MuJoCo's compiler then runs for hours, or
-ends the process. Such files are refused.
+ends the process. So it does where the name of a class that is not there holds a format of C's printf (MuJoCo 4.0.0).
+Such files are refused.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from pathlib import Path
+
+from ..errors import shown
 
 MOST_ELEMENTS = 1_000_000
 MOST_ENTRIES = 100_000_000  # of a height field or a texture; of values that <size> reserves
@@ -25,8 +28,8 @@ def check_expansion(file: Path) -> str:
 
     Raises:
         ET.ParseError: the file is not XML.
-        ValueError: the file is UTF-16, expands to more than ``MOST_ELEMENTS`` elements or ``MOST_ENTRIES`` entries, or
-            includes or attaches itself.
+        ValueError: the file is UTF-16, expands to more than ``MOST_ELEMENTS`` elements or ``MOST_ENTRIES`` entries,
+            includes or attaches itself, or names a class with %.
     """
     if file.read_bytes()[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise ValueError(f"load: {str(file)!r} is UTF-16; MuJoCo reads UTF-8; save it as UTF-8")
@@ -43,6 +46,8 @@ def _check(file: Path, root: ET.Element, above: list[Path], seen: dict[Path, int
     total, open_elements = 0, [(root, 1)]
     while open_elements:
         element, copies = open_elements.pop()
+        if "%" in element.get("class", ""):
+            _refuse(file, element, f"class '{shown(element.get('class', ''))}' has %; MuJoCo takes it for a format")
         copies *= _copies(element)
         total += copies * (1 if element.tag not in PARTS else _part(file, element, above, seen))
         if total > MOST_ELEMENTS:
@@ -89,4 +94,4 @@ def _whole(word: str) -> int:
 
 
 def _refuse(file: Path, element: ET.Element, why: str) -> None:
-    raise ValueError(f"load: {str(file)!r}, <{element.tag}>: {why}; correct the file")
+    raise ValueError(f"load: {str(file)!r}, <{shown(element.tag)}>: {why}; correct the file")

@@ -8,6 +8,7 @@ from typing import Any
 
 import mujoco
 
+from ..errors import shown
 from ..scene.collision_shapes import NONE, ShapeSelection
 from ..scene.scene import Scene
 from .expansion import check_expansion
@@ -58,6 +59,7 @@ def compiled(file: Path) -> tuple[mujoco.MjModel, list[str], dict[int, str]]:
     raise ValueError(f"load: {str(file)!r}: MuJoCo refuses it: {_one_line(last)}; correct the file") from None
 
 
+MOST_LETTERS = 1000  # of MuJoCo's messages, which hold names of the file
 REFUSALS = (ValueError, RuntimeError, MemoryError, mujoco.FatalError, mujoco.UnexpectedError)
 """What MuJoCo's compiler raises, of memory that it does not get, too."""
 
@@ -118,4 +120,4 @@ def _gives_no_mass(spec: Any, geom: Any) -> bool:
 
 
 def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
+    return shown(" ".join(str(error).split()), MOST_LETTERS)
