@@ -38,6 +38,12 @@ def declared(name):
 
 
 NESTED_VARIANTS = 'def "a"\n{\nvariantSet "v" = {\n"x" {\n' * 20_000
+MULTIPLIED = "#usda 1.0\n" + "".join(
+    f'def "a{level}"\n{{\n'
+    + "".join(f'def "b{number}" (references = </a{level + 1}>)\n{{\n}}\n' for number in range(10))
+    + "}\n"
+    for level in range(9)
+)
 REFUSED = {
     "a torn file": GOOD[:-40],
     "a file of zeros": "\0" * 400,
@@ -100,6 +106,15 @@ def test_files_above_the_folder_are_read_if_they_are_usd(tmp_path):
     folder.mkdir()
     scene, _ = loaded(folder, composed("references = @../other.usda@</World>"))
     assert "/World/arm/hand" in scene.body_labels
+
+
+def test_prims_that_refer_to_ten_others_level_by_level_are_counted(tmp_path):
+    """Not composed: they would be more than a billion. In a file that the first one names, too."""
+    with pytest.raises(ValueError, match=r"^load: .*robot\.usda' has more than 1000000 prims"):
+        loaded(tmp_path, MULTIPLIED)
+    (tmp_path / "many.usda").write_text(MULTIPLIED)
+    with pytest.raises(ValueError, match=r"^load: .*robot\.usda' has more than 1000000 prims"):
+        loaded(tmp_path, composed("references = @./many.usda@</a0>"))
 
 
 def test_levels_of_a_file_that_another_names_count(tmp_path):

@@ -94,7 +94,7 @@ def load(
         UserWarning: A mass or an inertia was replaced, or taken from shapes. The message names the bodies. A mimic in a
             URDF names no joint of the file and was left out, or names a fixed one, so that its joint is held. Limits of
             a URDF, such as effort="0", stop joints or what drives them. An MJCF file holds contacts, sensors or other
-            things that a scene leaves out.
+            things that a scene leaves out, and a USD file attributes of physics.
     """
     file = Path(path)
     importer = robot_format(file)

@@ -20,7 +20,7 @@ from ..model_contacts import ModelShapes
 from ..worlds import WorldRows, quote_labels
 from .inertia_repair import repair_bodies
 from .usd_attributes import left_out
-from .usd_stage import check_nesting, check_values, prepare
+from .usd_stage import check_nesting, check_size, check_values, prepare
 from .usd_values import (
     ImportedJoints,
     VendorAttributes,
@@ -79,6 +79,7 @@ def _read(
     from pxr import Usd, UsdGeom, UsdPhysics  # an ImportError names the extra
 
     check_nesting(file)
+    check_size(file)
     stage = Usd.Stage.Open(str(file))
     stage.Reload()  # layers stay in memory as long as a stage has them
     metre, kilogram = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)

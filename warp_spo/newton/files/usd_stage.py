@@ -24,6 +24,8 @@ PHYSICS = re.compile(r"(physics|drive|limit|state|physx\w*|omniphysics|mjc|newto
 """Namespaces of the attributes of physics."""
 LEVELS = 1000
 """Levels of braces in a text: OpenUSD's parser calls itself at each, and its stack ends somewhere above 5,000."""
+PRIMS = 1_000_000
+"""Prims of a stage, each with those to which it refers; ten references a level would make billions."""
 TOKENS = re.compile(rb'"""(?:.|\n)*?"""|"(?:\\.|[^"\\\n])*"|\'(?:\\.|[^\'\\\n])*\'|#[^\n]*|@[^@\n]*@|[{}]')
 ASSETS = re.compile(rb"@([^@\n]+\.usd[acz]?)@")
 AXES = ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
@@ -75,7 +77,8 @@ def check_nesting(file: Path) -> None:
 
 def _texts(path: Path) -> Iterator[tuple[str, bytes]]:
     """Yield name and text of each layer of a file that is a text."""
-    head = path.open("rb").read(4)
+    with path.open("rb") as file:
+        head = file.read(4)
     if head.startswith(b"PK"):
         try:
             with zipfile.ZipFile(io.BytesIO(path.read_bytes())) as archive:
@@ -86,6 +89,42 @@ def _texts(path: Path) -> Iterator[tuple[str, bytes]]:
             return  # OpenUSD says what is wrong
     elif not head.startswith(b"PXR-"):
         yield path.name, path.read_bytes()
+
+
+def check_size(file: Path) -> None:
+    """Raise ValueError if the prims of a USD file, with all to which they refer, are more than ``PRIMS``."""
+    from pxr import Sdf
+
+    counts: dict[tuple[str, Any], int] = {}
+
+    def count(layer: Any, path: Any) -> int:
+        key = layer.identifier, path
+        if key in counts:
+            return counts[key]
+        counts[key] = 0  # of a cycle, which composition refuses
+        paths: list[Any] = []
+        layer.Traverse(path, paths.append)
+        found = [layer.GetPrimAtPath(one) for one in paths if one.IsPrimPath() or one.IsPrimVariantSelectionPath()]
+        specs = [spec for spec in found if spec]
+        total = len(specs)
+        for spec in specs:
+            for arc in (*spec.referenceList.GetAddedOrExplicitItems(), *spec.payloadList.GetAddedOrExplicitItems()):
+                other = Sdf.Layer.FindOrOpenRelativeToLayer(layer, arc.assetPath) if arc.assetPath else layer
+                if other and total <= PRIMS:
+                    total += count(
+                        other, arc.primPath or Sdf.Path.absoluteRootPath.AppendChild(other.defaultPrim or "_")
+                    )
+            for classes in (spec.inheritPathList, spec.specializesList):
+                total += sum(count(layer, one) for one in classes.GetAddedOrExplicitItems() if total <= PRIMS)
+        counts[key] = min(total, PRIMS + 1)
+        return counts[key]
+
+    layer = Sdf.Layer.FindOrOpen(str(file))
+    if layer is None:
+        return  # OpenUSD says what is wrong
+    layers = [layer, *(Sdf.Layer.FindOrOpenRelativeToLayer(layer, path) for path in layer.subLayerPaths)]
+    if sum(count(one, Sdf.Path.absoluteRootPath) for one in layers if one) > PRIMS:
+        raise ValueError(f"load: {str(file)!r} has more than {PRIMS} prims, with those to which it refers; split it")
 
 
 def all_prims(stage: Any) -> Iterable[Any]:
