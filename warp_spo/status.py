@@ -29,7 +29,8 @@ class Status(enum.IntEnum):
     DIGITS = 3
     """The result may keep fewer than half of the dtype's digits, by an estimate from above."""
     RANGE = 4
-    """A pivot, a product that forms it, or the result is too small or too large for the dtype's normal numbers."""
+    """A pivot, a product that forms it, or the result is too small or too large for the dtype's normal numbers; or an
+    angle is beyond 1e10 rad, or the squares of a quaternion's entries overflow or vanish."""
     NOT_SETTLED = 5
     """The last pass of a step ended with a limit or a friction law on another branch than the pass had assumed; or
     velocity terms of what the last round of a step with contacts found changed a rate by a tenth."""
@@ -87,7 +88,9 @@ _ADVICE = {
     Status.DIGITS: (
         "Use float64 for such worlds, give light links armature, and lay joint axes along the axes of their anchors."
     ),
-    Status.RANGE: "Change the units of mass or length, or use float64.",
+    Status.RANGE: (
+        "Change the units of mass or length, use float64, take full turns off angles, or normalise quaternions."
+    ),
     Status.NOT_SETTLED: "Use a shorter dt. The step stands, with a force that a shorter dt would correct.",
     Status.LOOPS: (
         "Use float64, or keep the mechanism away from configurations in which it can branch or lock. Cut the loops at "

@@ -22,6 +22,7 @@ from ..execution.device_facts import read_facts
 from ..execution.node.sweeps import Sweeps
 from ..execution.parameters import RIGID_VALUES, VARIABLE
 from ..execution.programs import Programs
+from ..execution.status_words import kinds_of_coordinates
 from ..runtime.arrays import parse_device, parse_dtype
 from ..runtime.autograd import TensorValues, register
 from ..scene.scene import Scene
@@ -332,6 +333,11 @@ class Dynamics:
     def _later_status(self) -> wp.array:
         """Array into which a step writes the status of all substeps but the first [world]."""
         return wp.empty(self.worlds, dtype=wp.int32, device=self.device)
+
+    @functools.cached_property
+    def _coordinate_kinds(self) -> wp.array:
+        """What each coordinate is to the last check of a status [coordinate]."""
+        return wp.array(kinds_of_coordinates(self.scene), dtype=wp.int32, device=self.device)
 
     @functools.cached_property
     def _mask(self) -> wp.array:

@@ -130,8 +130,9 @@ def forward_dynamics(
             * 1, PIVOT: Mass is not positive definite to working precision, because of a massless leaf or a singular
               hinge (three angles at 90 degrees, a point mass on a ball). The result is NaN or wrong. Give that hinge
               armature, or its body inertia, or use a ball instead of three angles.
-            * 4, RANGE: D, or a number that enters it, is too small or too large for the dtype's normal numbers, or the
-              result overflows or is subnormal. Change units (mass, length) or use float64.
+            * 4, RANGE: D, or a number that enters it, is too small or too large for the dtype's normal numbers, the
+              result overflows or is subnormal, an angle is beyond 1e10 rad, or the squares of a quaternion overflow or
+              vanish. Change units (mass, length), use float64, or take full turns off.
             * 3, DIGITS: by an estimate from above, D keeps fewer than half of the dtype's digits, perhaps none. The
               result stands. Use float64 for such worlds, give light links armature, and lay hinge axes along the axes
               of the anchors.
@@ -160,6 +161,8 @@ def forward_dynamics(
             swept = engine.launch(FORWARD_DYNAMICS, qdd, **given)
             if status_words is not None:
                 words.write(self.recursions, **given, qdd=qdd, status=status_words, factored=swept)
+        if status_words is not None:
+            words.check_results(self.recursions, self._coordinate_kinds, given["q"], status_words, rates=qdd)
     return call.result
 
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import warp as wp
 
-from ..kernels import declare, loops
+from ..hinges.elementary import PRISMATIC
+from ..kernels import declare, loops, result_check
 from ..kernels import status as kernels
 from ..kernels.spatial import ARTICULATED
 from ..runtime import launches
+from ..scene.scene import Scene
 from .node.sweeps import Sweeps
 
 
@@ -69,3 +74,31 @@ def _mark_quaternions(run: Sweeps, q: wp.array, status: wp.array) -> None:
     """Set QUATERNION in worlds with a quaternion of zeros, by one launch more where hinges have quaternions."""
     if any(element.kind.quaternion is not None for hinge in run.scene.hinges for element in hinge.elements):
         run.launch(kernels.mark_quaternions, run.worlds, [run.topology, q], [status])
+
+
+def check_results(
+    run: Sweeps, kinds: wp.array, q: wp.array, status: wp.array, word: int = result_check.RANGE, **written: Any
+) -> None:
+    """Set ``status`` [world] where what a call has written is not finite, or q is beyond the reach of a reduction.
+
+    Args:
+        kinds: :func:`kinds_of_coordinates` on the device. q: the state that the call was given.
+        word: of results that are not finite where no other word says so.
+        written: arrays by name: q_after, rates, qdd, slip, excess, residual, gap, force, poses, velocities.
+    """
+    declare(result_check, run.dtype)
+    names = ("q_after", "rates", "qdd", "slip", "excess", "residual", "gap", "force", "poses", "velocities")
+    run.launch(result_check.check_results, run.worlds, [q, kinds, word, *map(written.get, names)], [status])
+
+
+def kinds_of_coordinates(scene: Scene) -> np.ndarray:
+    """Return what each coordinate is to the reduction of angles and quaternions [coordinate], int32."""
+    kinds = np.zeros(scene.coord_count, dtype=np.int32)
+    for hinge, first in zip(scene.hinges, scene.q_start, strict=False):
+        for kind, _ in hinge.elements:
+            if kind.quaternion is not None:
+                kinds[first + kind.quaternion] = result_check.ROTATION
+            elif kind is not PRISMATIC:
+                kinds[first : first + kind.coordinates] = result_check.ANGLE
+            first += kind.coordinates
+    return kinds

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from ...errors import as_integer
+from ...execution import status_words
 from ...execution.routine import Routine
 from ...kernels import combination
 from ...recursions.derivatives import adjoints
@@ -206,7 +207,16 @@ def _step(
         q_out, qd_out = engine.write(call, STEP, outs, given)
         interval = StepArrays(given["q"], given["qd"], q_out, qd_out, given["dt"])
         given = {name: value for name, value in given.items() if name not in StepArrays._fields}
+        words, found = given.get("status"), {"qdd": given.get("qdd"), **states, **reports}
+        if words is not None:
+            interval = interval._replace(q=_apart(self, interval))
         _launch(self, call, integrator, count, interval, given, buffers)
+        if words is not None:
+            found = {name.removeprefix("contact_"): array for name, array in found.items()}
+            found = {"force" if name == "f" else name: array for name, array in found.items()}
+            word = Status.LOOPS if self.closed and self.embedding is None else Status.RANGE
+            kinds, after = self._coordinate_kinds, {"q_after": q_out, "rates": qd_out}
+            status_words.check_results(self.recursions, kinds, interval.q, words, word, **after, **found)
     return call.result
 
 
@@ -327,6 +337,15 @@ def _launch(
         interval = interval._replace(q=interval.q_out, qd=interval.qd_out)
     if bodies is not None and not of_last:
         integrators.write_bodies(dyn, interval.q_out, interval.qd_out, bodies)
+
+
+def _apart(dyn: Dynamics, interval: StepArrays) -> wp.array:
+    """Return q before the step in an array that the step does not write over."""
+    if interval.q.ptr != interval.q_out.ptr:
+        return interval.q
+    q = dyn.recursions.array("q before a step", *interval.q.shape)
+    launches.copy(q, interval.q)
+    return q
 
 
 def explain(dyn: Dynamics) -> str:
