@@ -43,7 +43,9 @@ def test_refused_in_words(operation, name, device):
             run(kind, given(kind, double)[name])
     with explained(ValueError, call, f"{name} is a NumPy array complex128", "expected float32", "convert"):
         run("numpy", good.astype(complex))
-    with explained(ValueError, call, f"{name} is a torch array", "on meta", f"expected it on {device}", "move it"):
+    with explained(
+        ValueError, call, f"{name} is a torch array", "on meta", f"expected it on {device}", "torch.zeros_like("
+    ):
         run("torch", torch.zeros(good.shape, device="meta"))
     if device.is_cuda:
         with explained(ValueError, call, f"{name} is a", "on cpu", f"expected it on {device}", "move it there"):

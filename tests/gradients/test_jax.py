@@ -393,3 +393,16 @@ def test_a_call_waits_for_what_jax_still_computes():
 def test_a_dynamics_that_jax_uses_still_pickles():
     dyn = robot("float32")
     assert pickle.loads(pickle.dumps(dyn)).dtype is wp.float32
+
+
+def test_errors_name_ways_that_are_taken():
+    """Not a Dynamics with dtype="int32", and no function of what is no operation."""
+    dyn = robot()
+    q = jnp.zeros((WORLDS, dyn.scene.coord_count), jnp.int32)
+    with pytest.raises(ValueError, match=r"q is int32 .*; expected float64; pass q.astype\('float64'\)$"):
+        spo_jax.function(dyn, "forward_dynamics")(q)
+    with pytest.raises(ValueError, match=r"convert it to float64; in JAX that takes .*jax_enable_x64"):
+        dyn.forward_dynamics(q)
+    E = spo.BWA(spo.Digraph([(0, 1)]), [np.eye(1)])
+    with pytest.raises(TypeError, match=r"traced by JAX.*; call BWA.apply outside of JAX's functions"):
+        jax.jit(lambda x: E.apply(x))(jnp.zeros((1, 2)))

@@ -205,3 +205,12 @@ def test_refused(case):
     action, error, words = REFUSED[case]
     with pytest.raises(error, match=words):
         action()
+
+
+def test_errors_name_ways_that_are_taken():
+    """An array of one world for an operator of any number of worlds, and one of no numbers."""
+    E = BWA(Digraph([(0, 1)]), [np.eye(1)])
+    with pytest.raises(ValueError, match="shape of one world; stack one for each world along a first axis"):
+        E @ np.ones(2)
+    with pytest.raises(ValueError, match=r"on meta; expected it on cpu; .*torch.zeros_like\(x, device='cpu'\)"):
+        E @ torch.ones((3, 2), device="meta", dtype=torch.float64)

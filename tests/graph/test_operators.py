@@ -141,6 +141,7 @@ def test_nilpotent_at_depth_plus_one(scene, device):
     """Lemma 2, made sharp: E^(depth + 1) = 0 exactly; with weights of one E^depth is not."""
     s = scene_of(scene)
     E = BWA(s.graph, s.weights, dims=s.dims, device=device)
+    assert E.power(0).dense().shape == E.power(1).dense().shape
     assert not E.power(s.graph.depth + 1).dense().any()
     assert not E.power(s.graph.depth + 100).dense().any()
     ones = [None if w is None else np.ones((1, 1)) for w in s.weights]

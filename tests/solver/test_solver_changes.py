@@ -162,3 +162,10 @@ def test_other_integrators_step_too():
         assert after.joint_q.numpy()[0] == pytest.approx(
             np.exp(-1.5 * t) * (np.cos(s * t) + 1.5 / s * np.sin(s * t)), abs=2e-5
         )
+
+
+@pytest.mark.parametrize("flags", [1 << 30, -1, int(ModelFlags.ALL) + 1])
+def test_flags_that_nobody_knows_are_refused(flags):
+    solver = SolverSPO(replicated(arm(joints=1, axis=(0, 1, 0)), 1))
+    with pytest.raises(ValueError, match=r"no newton.ModelFlags; expected some of JOINT_PROPERTIES.* or ALL"):
+        solver.notify_model_changed(flags)

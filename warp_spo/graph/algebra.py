@@ -238,10 +238,11 @@ class Identity(Operator):
         size: number of rows and columns.
         device: the CPU unless given.
         dtype: "float32" or "float64".
+        worlds: number of worlds of :meth:`dense`; 1 goes with operators of any number.
     """
 
-    def __init__(self, size: int, device="cpu", dtype="float64", kind: str | None = None):
-        super().__init__((size, size), 1, parse_device(device), parse_dtype(dtype, "Identity"), kind)
+    def __init__(self, size: int, device="cpu", dtype="float64", kind: str | None = None, worlds: int = 1):
+        super().__init__((size, size), worlds, parse_device(device), parse_dtype(dtype, "Identity"), kind)
         self.form = ("identity",)
 
     def _apply(self, x: wp.array, out: wp.array, alpha: float, accumulate: bool, space: Workspace) -> None:

@@ -159,7 +159,7 @@ class BWA(Operator):
     def power(self, exponent: int) -> Operator:
         """Return E^exponent, whose blocks are sums over paths of that length of products of weights (Lemma 1).
 
-        Exponent 0 gives the identity.
+        Exponent 0 gives the identity, of as many worlds as E has.
         """
         count = as_integer(exponent)
         if count is None or count < 0:
@@ -168,7 +168,7 @@ class BWA(Operator):
                 "but its resolvent has one, E.resolvent().inverse"
             )
         if count == 0:
-            return Identity(self.shape[0], self.device, self.dtype, self.kind)
+            return Identity(self.shape[0], self.device, self.dtype, self.kind, self.worlds)
         # E^(depth + 1) is zero already (Lemma 2)
         return Product(*[self] * min(count, len(self.graph.levels)))
 

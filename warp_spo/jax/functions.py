@@ -223,9 +223,11 @@ class Function:
         if not isinstance(array, jax.Array):
             raise TypeError(f"{self.name}: {name} is of type {type(array).__name__}; expected a JAX or a NumPy array")
         if array.dtype != dtype:
+            way = f"pass {name}.astype({np.dtype(dtype).name!r})"
+            if array.dtype.name in ("float32", "float64"):
+                way += f", or build the Dynamics with dtype={array.dtype.name!r}"
             raise ValueError(
-                f"{self.name}: {name} is {array.dtype} {array.shape}; expected {np.dtype(dtype).name}; pass "
-                f"{name}.astype({np.dtype(dtype).name!r}), or build the Dynamics with dtype={array.dtype.name!r}"
+                f"{self.name}: {name} is {array.dtype} {array.shape}; expected {np.dtype(dtype).name}; {way}"
             )
         return array
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar
@@ -442,7 +444,7 @@ class SolverSPO(MassMatrixInterface, SolverBase):
                 ``newton.ModelFlags.BODY_INERTIAL_PROPERTIES`` names ``body_mass``, ``body_com`` and ``body_inertia``.
 
         Raises:
-            ValueError: Inside a capture, a flag names no variable array.
+            TypeError, ValueError: No such flags. Inside a capture, a flag names no variable array.
         """
         names = self._arrays.names_of_flags(read_flags("SolverSPO.notify_model_changed", ModelFlags, flags))
         variable = [name for name in names if name in self._values]
@@ -491,8 +493,19 @@ def check_state(call: str, name: str, state: Any) -> None:
 
 
 def read_flags(call: str, kind: type, flags: Any) -> int:
-    """Return ``flags`` as an int, or raise TypeError."""
+    """Return ``flags`` as an int.
+
+    Raises:
+        TypeError: they are no integer. ValueError: a bit is of no flag of this kind.
+    """
     bits = as_integer(flags)
     if bits is None:
         raise TypeError(f"{call}: flags is {flags!r}; expected newton.{kind.__name__}, or an integer of their bits")
+    known = functools.reduce(operator.or_, map(int, kind))  # type: ignore[call-overload]
+    if bits & ~known:
+        names = ", ".join(flag.name for flag in kind if flag.name != "ALL")  # type: ignore[attr-defined]
+        raise ValueError(
+            f"{call}: flags is {bits:#x}, with bits that are no newton.{kind.__name__}; expected some of "
+            f"{names}, joined by |, or ALL"
+        )
     return bits

@@ -80,7 +80,10 @@ def kind_of(array: object, call: str, name: str) -> str:
     if "torch" in sys.modules and torch_border().is_tensor(array):
         return TORCH
     if dlpack.is_traced(array):
-        way = f"call warp_spo.jax.function(dyn, {call.rpartition('.')[2]!r}) there"
+        owner, _, method = call.rpartition(".")
+        way = f"call warp_spo.jax.function(dyn, {method!r}) there"
+        if owner != "Dynamics":
+            way = f"call {call} outside of JAX's functions"
         if call == "Dynamics.set":
             way = f"set values outside of JAX's functions, or build Dynamics with variable=({name!r},) and give them "
             way += f"to a warp_spo.jax.function(dyn, ..., values=({name!r},)), which has gradients by them"
@@ -362,6 +365,8 @@ class Call:
             way = f"convert it to {dtype.__name__}"
             if dtype is self.dtype and _dtype_name(array) in _DTYPES:
                 way += f", or build the object with dtype={_dtype_name(array)!r}"
+            if kind == "JAX" and dtype is wp.float64:
+                way += "; in JAX that takes jax.config.update('jax_enable_x64', True)"
         else:
             way = _way_to_shape(name, kind, came, shape, meaning)
         sizes = ", ".join("any" if size == -1 else str(size) for size in shape) + ("," if len(shape) == 1 else "")
@@ -377,7 +382,10 @@ class Call:
                 f"pass {name}.to_dense()"
             )
         if contiguous:
-            way = f"move it there, or build the object with device={str(device_of(array, kind))!r}"
+            place = str(device_of(array, kind))
+            way = f"move it there, or build the object with device={place!r}"
+            if place == "meta":
+                way = f"pass a tensor that holds numbers, as torch.zeros_like({name}, device={self.device.alias!r})"
             raise ValueError(f"{self.name}: {name} is {_describe(array, kind)}; expected it on {self.device}; {way}")
         way = f"pass {name}.contiguous()" if kind in (TORCH, WARP) else "pass a contiguous copy"
         if change:
@@ -473,7 +481,8 @@ def _way_to_shape(name: str, kind: str, came: Any, shape: tuple, meaning: str) -
         return f"reshape {name}, or build the object for this size"
     if shape[0] == 1:
         return f"pass {name}.reshape({(1, *came)})" if kind == WARP else f"pass {name}[None]"
-    return f"it has the shape of one world; stack {shape[0]} of them along a first axis"
+    count = "one for each world" if shape[0] < 0 else f"{shape[0]} of them"
+    return f"it has the shape of one world; stack {count} along a first axis"
 
 
 def _dtype_name(array: Any) -> str:
