@@ -42,33 +42,47 @@ def choose_chains(
     """
     uses: Counter = Counter(value.key for x in scalars for value in x.args if value.__class__ is Scalar)
     known, inside = {x.key for x in scalars}, set()  # type: set[tuple], set[tuple]
+    barren: set[tuple] = set()  # keys of what holds no product; it stays so, because ``inside`` only grows
+    first: dict[
+        tuple, int
+    ] = {}  # by the key of a sum, the number of the product that is found in it, until ``inside`` grows
 
-    def terms_of(value: Value, sign: int) -> list[tuple[int, Scalar]] | None:
-        """Return the terms of a sum that is used once, a product without a statement first; None: it has none.
+    def terms_of(value: Value, sign: int, oldest: int) -> list[tuple[int, Scalar]] | None:
+        """Return the terms of a sum that is used once, a product without a statement first.
+
+        None: it has none, or the first that is found is older than the number ``oldest``.
 
         Sums are searched depth first, with a list of what is left to try: they may have thousands of terms. The trail
-        of a value holds the terms beside it, the nearest first.
+        of a value holds the sums around it and the terms beside it, the nearest first.
         """
+        if first.get(value.key, oldest) < oldest:
+            return None
         untried: list[tuple[Value, int, Any]] = [(value, sign, None)]
         while untried:
             value, sign, trail = untried.pop()
-            if value.__class__ is not Scalar or uses[value.key] != 1 or value.key in stored or value.key in inside:
+            if value.__class__ is not Scalar or value.key in barren:
+                continue
+            barren.add(value.key)  # unless a product is found in it
+            if uses[value.key] != 1 or value.key in stored or value.key in inside:
                 continue
             if value.key not in known or (value.op == "mul" and value.key in fused):
                 continue
             if value.op == "mul":
-                found = [(sign, value)]
+                number, found = value.number, [(sign, value)]
+                barren.discard(value.key)
                 while trail is not None:
-                    term, trail = trail
+                    key, term, trail = trail
                     found.append(term)
-                return found
+                    barren.discard(key)
+                    first[key] = number
+                return found if number >= oldest else None
             if value.op in ("add", "sub"):
                 a, b = value.args
                 signs = sign, -sign if value.op == "sub" else sign
                 product = taken.get(value.key)
                 for at, inner, other in ((1, b, a), (0, a, b)):  # the last one is tried first
                     if inner is not product and (product is not None or other.__class__ is Scalar):
-                        untried.append((inner, signs[at], ((signs[1 - at], other), trail)))
+                        untried.append((inner, signs[at], (value.key, (signs[1 - at], other), trail)))
         return None
 
     chains: dict[tuple, Chain] = {}
@@ -80,11 +94,12 @@ def choose_chains(
         for at, (inner, other) in enumerate(((b, a), (a, b))):
             if inner.__class__ is not Scalar or inner.op not in ("add", "sub"):
                 continue
-            found = terms_of(inner, signs[1 - at])
-            if found is not None and scalar.number - found[0][1].number <= NEAR:
+            found = terms_of(inner, signs[1 - at], scalar.number - NEAR)
+            if found is not None:
                 products = {term.key for _, term in found if term.key in fused or term is found[0][1]}
                 chains[scalar.key] = Chain(signs[at], other, found, products)
                 inside |= {found[0][1].key} | sums_of(inner, {term.key for _, term in found})
+                first.clear()
                 break
     return chains, inside
 
