@@ -86,7 +86,8 @@ _ADVICE = {
         "buffers, or not a whole number, or a ground_field that the set of fields lacks; reset the world."
     ),
     Status.DIGITS: (
-        "Use float64 for such worlds, give light links armature, and lay joint axes along the axes of their anchors."
+        "Use float64 for such worlds, give light links armature, and lay joint axes along the axes of their anchors. "
+        "Where tau nearly cancels the other loads, compute and pass it in float64."
     ),
     Status.RANGE: (
         "Change the units of mass or length, use float64, take full turns off angles, or normalise quaternions."

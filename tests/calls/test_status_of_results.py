@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 import warp_spo as spo
-from support import pair_scenes
+from support import pair_scenes, zoo
 from warp_spo.examples import double_fourbar
 from warp_spo.kernels import result_check
 
+LAW = 6.0  # the largest ratio of an error to the law, of 3,000 states, was 4.7
 LEVER = spo.Body(1.0, com=(0.1, 0.0, 0.0), inertia=np.eye(3))
 
 
@@ -63,3 +64,24 @@ def test_contact_forces_that_are_not_finite_have_a_word(substeps, device):
     found = dyn.step(q, qd, None, 1e-3, status=status, report=report, options=spo.StepOptions(substeps=substeps))
     fine = [all(np.isfinite(x[world]).all() for x in (*found, report.contact_f)) for world in range(2)]
     assert fine == [True, False] and status[0] != spo.Status.RANGE and status[1] != 0
+
+
+@pytest.mark.parametrize("left", [1.0, 1e-2, 1e-4])
+@pytest.mark.parametrize(
+    ("count", "kind"), [(2, "ball"), pytest.param(8, "ball", marks=pytest.mark.slow), (5, "revolute")]
+)
+def test_torques_that_nearly_cancel_obey_their_law_and_have_a_word(count, kind, left, device):
+    """Of inverse dynamics, for accelerations of size ``left``: eps |Mass^-1| |tau|, and OK keeps half of the digits."""
+    worlds, rng, eps = 32, np.random.default_rng(0), np.finfo(np.float32).eps
+    scene = zoo.from_parents(list(range(-1, count - 1)), [kind] * count, 5)
+    q, qd = np.float32(zoo.random_state(scene, worlds, 4).q), np.float32(rng.normal(size=(worlds, scene.dof_count)))
+    single, double = (spo.Dynamics(scene, worlds, device=device, dtype=dtype) for dtype in ("float32", "float64"))
+    tau, status = single.inverse_dynamics(q, qd, np.float32(left * rng.normal(size=qd.shape))), words(worlds)
+    qdd = single.forward_dynamics(q, qd, tau, status=status)
+    q, qd, tau = map(np.float64, (q, qd, tau))
+    wanted, inverse = double.forward_dynamics(q, qd, tau), np.abs(np.linalg.inv(double.mass_matrix(q)))
+    scale = np.linalg.norm(wanted, axis=1)
+    error = np.linalg.norm(qdd - wanted, axis=1) / scale
+    assert (error <= LAW * eps * np.linalg.norm(np.einsum("wij,wj->wi", inverse, np.abs(tau)), axis=1) / scale).all()
+    assert (status[error > 4.0 * eps**0.5] == spo.Status.DIGITS).all()
+    assert (status[error < 0.01 * eps**0.5] == 0).all()

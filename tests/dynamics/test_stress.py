@@ -104,7 +104,7 @@ def test_digits_lost_are_estimated_from_above_and_not_far(dtype, device):
 
 
 def test_a_word_costs_nothing_where_it_is_not_asked_for(device, monkeypatch):
-    """Not asked for: no launch more, and none of its kernels is made. Asked for: one a level, and one."""
+    """Not asked for: no launch more, and none of its kernels is made. Asked for: one a level, and two."""
     p = scenes.floating_chain(2)
     counts, made = [], []
     launch, factories = wp.launch, {name: getattr(status_kernels, name) for name in ("lost_digits", "status_word")}
@@ -120,7 +120,7 @@ def test_a_word_costs_nothing_where_it_is_not_asked_for(device, monkeypatch):
         if status is None:
             plain = len(counts)
             assert not made and "lost" not in dyn.recursions._workspace
-    assert len(counts) == plain + p.scene.tree.depth + 2 and made
+    assert len(counts) == plain + p.scene.tree.depth + 3 and made
     np.testing.assert_array_equal(*found)
 
 

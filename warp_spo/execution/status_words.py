@@ -51,7 +51,7 @@ def write(
         arguments = [run.topology, first, *inputs]
         launches.launch(kernel, (count, run.worlds), arguments, [rounding, lost], device=run.device)
     values = [p.tree, p.com, p.rigid, armature, p.gravity]
-    run.launch_nodes(kernels.status_word, run.worlds, [q, qd, tau, body_f, *values, lost, qdd], [status])
+    run.launch_nodes(kernels.status_word, run.worlds, [q, qd, tau, body_f, *values, factors[2], lost, qdd], [status])
     _mark_quaternions(run, q, status)
 
 
