@@ -310,12 +310,9 @@ class ContactStepTrace(Step):
         gains = {dof: self._pass_variable(GAIN, dof) for link in self.links for dof in link.dofs}
         rates = {dof: self.qd(dof) + gain for dof, gain in gains.items()}
         stores: list[Store] = []
-        q_after, qd_after = self.state_after(rates)
-        for link in self.links:
-            trace.label(link, "q")
-            stores += [Store("out", (dof,), qd_after[dof] + self.kick(dof)) for dof in link.dofs]
-            coordinates = range(link.coordinate, link.coordinate + link.hinge.coordinates)
-            stores += [Store("q_out", (c,), q_after[c]) for c in coordinates]
+        for link, coordinates, after in self.states_after(rates):
+            stores += [Store("out", (dof,), x + self.kick(dof)) for dof, x in zip(link.dofs, after, strict=True)]
+            stores += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(coordinates)]
             if qdd:
                 stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
         results = [item.value for item in stores]

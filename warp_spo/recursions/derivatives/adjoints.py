@@ -30,7 +30,7 @@ from ..model.links import Link
 from ..momentum import com, com_velocity
 from ..newton_euler import inverse_dynamics
 from ..step.actuation import actuator_force, build_joint_laws
-from ..step.descendants import state_after
+from ..step.descendants import states_after
 from .power import Gradients, Power
 from .tangents import coordinate_directions, tangent_gradient
 
@@ -196,9 +196,9 @@ def step_vjp(trace: Trace, wrt: tuple[str, ...], equations: TreeEquations | None
     links = trace.links.leaders
     dofs = [dof for link in links for dof in link.dofs]
     after = {dof: qd(dof) + h * qdd(dof) for dof in dofs}
-    q_after, qd_after = state_after(trace, links, trace.vector("q"), qd, after, h)
-    state = [Store("out", (dof,), rate) for dof, rate in qd_after.items()]
-    state += [Store("q_out", (c,), value) for c, value in q_after.items()]
+    moved = [*states_after(trace, links, trace.vector("q"), qd, after, h)]
+    state = [Store("out", (dof,), x) for link, _, rates in moved for dof, x in zip(link.dofs, rates, strict=True)]
+    state += [Store("q_out", (link.coordinate + c,), x) for link, values, _ in moved for c, x in enumerate(values)]
     state = equations.project_state(state)
     seeds = [pushed[item.array == "out"](item.index[0]) for item in state]
     results = [item.value for item in state]

@@ -164,13 +164,10 @@ class PassAdjoint(OnePass):
         """Return the state after the step and the variables that the pass leaves, and the cotangents of both."""
         trace, results, seeds = self.trace, [], []
         rates = {dof: self.qd(dof) + gain for dof, gain in self.gains.items()}
-        q_after, qd_after = self.state_after(rates)
-        for link in self.links:
-            trace.label(link, "q")
-            coordinates = range(link.coordinate, link.coordinate + link.hinge.coordinates)
-            results += [*(qd_after[dof] + self.kick(dof) for dof in link.dofs), *(q_after[c] for c in coordinates)]
+        for link, values, after in self.states_after(rates):
+            results += [*(x + self.kick(dof) for dof, x in zip(link.dofs, after, strict=True)), *values]
             seeds += [trace.vector("qd_cotangent")(dof) for dof in link.dofs]
-            seeds += [trace.vector("q_cotangent")(c) for c in coordinates]
+            seeds += [trace.vector("q_cotangent")(link.coordinate + c) for c in range(len(values))]
         seeds = [select(self.last, seed, 0.0) for seed in seeds]
         results += [item.value for item in self.pass_variables.stores]
         return results, seeds + [self._of_later(COTANGENT, self._dofs + x.index[0]) for x in self.pass_variables.stores]

@@ -151,21 +151,25 @@ class Closure:
         Where no motion moves the joint in any configuration, as that of a door's second hinge, the sum is rounding.
         The square of the distances that cancel in it takes its place, and 1 where rotations do.
         """
-        sliding, turning, _ = self.sums_of_squares(places)
+        sliding, turning = self.sums_of_squares(places)
         sliding, turning = (
             found if fixed is None else fixed for found, fixed in zip((sliding, turning), self.fixed_sizes, strict=True)
         )
         return [sliding] * len(self.slides) + [turning] * (self.rows - len(self.slides))
 
-    def sums_of_squares(self, places: dict[int, LinkPlacement]) -> tuple[Value, Value, Value]:
-        """Return those of velocities and of angular velocities, over unit rates of all dofs, and of distances."""
-        inner, outer = self._anchors(places)
+    def sums_of_squares(self, places: dict[int, LinkPlacement]) -> tuple[Value, Value]:
+        """Return those of the velocities and of the angular velocities, over unit rates of all dofs."""
+        _, outer = self._anchors(places)
         turning, sliding = 0.0, 0.0
-        distances = dot(inner.origin, inner.origin) + dot(outer.origin, outer.origin)
-        for _, w, v, arm in self._columns(places, outer):
+        for _, w, v, _ in self._columns(places, outer):
             turning, sliding = turning + dot(w, w), sliding + dot(v, v)
-            distances = distances + dot(arm, arm)
-        return sliding, turning, distances
+        return sliding, turning
+
+    def distances(self, places: dict[int, LinkPlacement]) -> Value:
+        """Return the sum of squares of the distances that cancel where no velocity moves the joint."""
+        inner, outer = self._anchors(places)
+        arms = [arm for _, _, _, arm in self._columns(places, outer)]
+        return total(dot(far, far) for far in (inner.origin, outer.origin, *arms))
 
     def _columns(
         self, places: dict[int, LinkPlacement], outer: LinkState
@@ -318,7 +322,7 @@ def _fixed_sizes(scene: Scene) -> list[FixedSizes]:
     for _ in range(3):
         q = (scene.neutral_q + rng.uniform(-1.0, 1.0, len(scene.neutral_q))).tolist()
         places = {id(link): place_link(link, q.__getitem__) for link in links.links}
-        values = [value for joint in joints for value in joint.sums_of_squares(places)]
+        values = [x for joint in joints for x in (*joint.sums_of_squares(places), joint.distances(places))]
         sums.append(np.array(evaluate(values, lambda *_: 0.0), dtype=float).reshape(-1, 3))
     sliding, turning, distances = np.max(sums, axis=0).T if joints else np.zeros((3, 0))
     return [

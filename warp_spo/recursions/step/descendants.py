@@ -9,7 +9,7 @@ which nothing acts stays at rest, whatever its parent does.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 from ...hinges.quaternions import Quaternion, multiply, quaternion_rotation, rotate_by
@@ -63,10 +63,10 @@ def has_free_descendants(scene: Scene) -> bool:
     return any(hinge.unconstrained and moves(hinge.parent) for hinge in scene.hinges)
 
 
-def state_after(
+def states_after(
     trace: Trace, links: list[Link], q: Entry, qd: Entry, rates: Entries, h: Value, carries: bool = True
-) -> tuple[Entries, Entries]:
-    """Return q' and qd' by entry, for ``rates`` = qd + h qdd of all dofs.
+) -> Iterator[tuple[Link, list[Value], list[Value]]]:
+    """Yield (link, coordinates, rates) after a step, for ``rates`` = qd + h qdd of all dofs.
 
     Args:
         links: leaders, parents first. q, qd: the state before the step.
@@ -82,7 +82,7 @@ def state_after(
         else:
             coordinates = integrate_link(link, q, rates.__getitem__, h)
         q_after |= {link.coordinate + c: value for c, value in enumerate(coordinates)}
-    return q_after, qd_after
+        yield link, coordinates, [qd_after[dof] for dof in link.dofs]
 
 
 def _carry(

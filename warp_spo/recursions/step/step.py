@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from ...scene.scene import Scene
 from ...status import Status
@@ -25,7 +25,7 @@ from ..model.links import Link
 from ..model.segments import Segment
 from ..model.tracing import Trace
 from .actuation import build_joint_laws
-from .descendants import has_free_descendants, state_after
+from .descendants import has_free_descendants, states_after
 from .joint_laws import Law, add_laws, is_number
 from .joint_space import JointSpace
 from .phases import PhaseBuilder, StepPhases
@@ -78,12 +78,9 @@ class Step:
             gains = self._solve({dof: self._pass_variable(GAIN, dof) for dof in gains})
         rates_after = {dof: self.qd(dof) + gain for dof, gain in gains.items()}
         stores: list[Store] = []
-        q_after, qd_after = self.state_after(rates_after)
-        for link in self.links:
-            trace.label(link, "q")
-            stores += [Store("out", (dof,), qd_after[dof]) for dof in link.dofs]
-            coordinates = range(link.coordinate, link.coordinate + link.hinge.coordinates)
-            stores += [Store("q_out", (c,), q_after[c]) for c in coordinates]
+        for link, coordinates, rates in self.states_after(rates_after):
+            stores += [Store("out", (dof,), rate) for dof, rate in zip(link.dofs, rates, strict=True)]
+            stores += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(coordinates)]
             if qdd:
                 stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
         stores = self.project_state(stores)
@@ -101,9 +98,9 @@ class Step:
         self.phases.add_epilogue(stores)
         return self.phases.phases
 
-    def state_after(self, rates: dict[int, Value]) -> tuple[dict[int, Value], dict[int, Value]]:
-        """Return q' and qd' by entry for ``rates`` = qd + h qdd; at a midpoint the rates stay as they are."""
-        return state_after(self.trace, self.links, self.q, self.qd, rates, self.h, self.carries)
+    def states_after(self, rates: dict[int, Value]) -> Iterator[tuple[Link, list[Value], list[Value]]]:
+        """Yield (link, q', qd') for ``rates`` = qd + h qdd; at a midpoint the rates stay as they are."""
+        return states_after(self.trace, self.links, self.q, self.qd, rates, self.h, self.carries)
 
     def _accelerations(self, tau: Callable[[int], Value]) -> dict[int, Value]:
         """Return qdd by dof for ``tau``, with the resistances of the active pieces added to Mass."""
