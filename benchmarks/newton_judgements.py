@@ -50,12 +50,30 @@ JUDGEMENTS: list[tuple[str, str, str]] = [
         r"test_rigid_contact\..*mesh_box_on_ground",
         NOT_OURS,
         "1000 kg on four points of 1e5 N/m and 1e3 N s/m that the test sets swing at 20 rad/s with a decay of 2 / s: "
-        "0.058 m/s after its second, 0.041 by implicit steps of 1/600 s, and 0.040 come out where it wants 0.01",
+        "0.058 m/s after its second, 0.03998 by implicit steps of 1/600 s, which is what comes out; it wants 0.01",
     ),
     (
         r"test_rigid_contact\..*convex_on_convex",
         NOT_OURS,
-        "bodies on bodies, whose contacts SolverSPO takes by pairs= alone; it warns that they pass through each other",
+        "passes no contacts, because MuJoCo finds those itself; its ground is a plane of 10 m, which SolverSPO touches "
+        "by lists of contacts alone, so that the body falls",
+    ),
+    (
+        r"test_rigid_friction_ramp\.",
+        NOT_OURS,
+        "MuJoCo's variants pass no contacts, because MuJoCo finds those with boxes itself, so that bodies fall; those "
+        "of XPBD give velocities to body_qd alone, where SolverSPO moves joint_qd",
+    ),
+    (
+        r"test_native_solvers_follow_step_contacts",
+        NOT_OURS,
+        "wants MuJoCo's own detection in the caller's list of contacts; SolverSPO finds contacts with the ground "
+        "itself and leaves that list alone",
+    ),
+    (
+        r"test_oversized_observables_fill_legacy_force",
+        NOT_OURS,
+        "wants the deprecated array Contacts.force filled; SolverSPO has the observable contact_f alone",
     ),
     (
         r"test_penalty_friction_solver_step",
@@ -66,11 +84,6 @@ JUDGEMENTS: list[tuple[str, str, str]] = [
         r"slow .*OutOfTime",
         OPEN,
         "takes more than a minute on two cores that others shared, compiling kernels of many shapes: no verdict",
-    ),
-    (
-        r"test_coupled_spring_updates",
-        NOT_OURS,
-        "SolverCoupled gives its solvers a ModelView; from_newton takes a newton.Model and says so",
     ),
 ]
 """(regular expression of the test, whose fault, why), the first that matches counts."""
