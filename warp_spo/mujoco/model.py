@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import mujoco
@@ -13,7 +14,7 @@ from ..scene.actuators import Keyframe
 from ..scene.collision_shapes import NONE, POINTS, ShapeSelection, moving_bodies
 from ..scene.scene import Scene
 from .actuators import read_actuators
-from .collision_shapes import collision_shapes
+from .collision_shapes import SOFTNESS, collision_shapes
 from .equality_constraints import read_equality_constraints
 from .mechanism import BALL, FREE, SIZES, Mechanism, rotation, scene_entries, xyzw
 from .source import Source
@@ -53,8 +54,8 @@ def from_mujoco(model: Any, contacts: Any = None, ground: Any = None, points: in
         ValueError: the model has no bodies, or a value is out of a scene's range.
 
     Warns:
-        UserWarning: once, with all that the scene leaves out: contacts, constraints that are not active, the motion of
-            mocap bodies, cameras and sensors.
+        UserWarning: once, with all that the scene leaves out: contacts, constraints that are not active, the softness
+            that the model gives to equalities and friction, the motion of mocap bodies, cameras and sensors.
     """
     if not isinstance(model, mujoco.MjModel):
         raise TypeError(
@@ -144,6 +145,29 @@ def _state(source: Source, mechanism: Mechanism, qpos: np.ndarray, qvel: np.ndar
     return np.concatenate(q), np.concatenate(qd)
 
 
+def _softness(source: Source) -> Iterator[str]:
+    """Yield which equalities and frictions of joints, exact in a scene, have a softness of their own."""
+    m = source.model
+    if source.disabled("CONSTRAINT"):
+        return
+    soft = lambda part, name: (getattr(m, f"{part}_{name}") != np.array(SOFTNESS[name])).any(axis=1)  # noqa: E731
+    if m.neq and not source.disabled("EQUALITY"):
+        used = np.flatnonzero(m.eq_active0.astype(bool) & (soft("eq", "solref") | soft("eq", "solimp")))
+        if used.size:
+            yield f"the softness (solref, solimp) of {_listed(source, 'equality', used)} (they hold exactly)"
+    if m.nv and not source.disabled("FRICTIONLOSS"):
+        dofs = (m.dof_frictionloss > 0.0) & (soft("dof", "solref") | soft("dof", "solimp"))
+        if dofs.any():
+            names = _listed(source, "joint", np.unique(m.dof_jntid[dofs]))
+            yield f"the softness (solreffriction, solimpfriction) of the friction of {names}"
+
+
+def _listed(source: Source, kind: str, indices: np.ndarray) -> str:
+    """Return the first eight of some elements in words, and the number of the others."""
+    more = f" and {len(indices) - 8} more" if len(indices) > 8 else ""
+    return ", ".join(source.words(kind, int(index)) for index in indices[:8]) + more
+
+
 def _warn(source: Source, touches: bool) -> None:
     """Warn of what the scene does not hold, all of it in one message; ``touches``: it has the source's contacts."""
     m = source.model
@@ -156,6 +180,7 @@ def _warn(source: Source, touches: bool) -> None:
         takes = "contacts=True takes these" if grounded else "contacts=True, ground=spo.Plane() take these and a floor"
         way = f"scene.with_contacts adds points that touch the ground, {takes}"
         found.append(f"contacts of {solid.size} geom(s){among} ({way})")
+    found += _softness(source)
     for mocap in np.flatnonzero(m.body_mocapid >= 0):
         found.append(f"the motion of mocap {source.words('body', int(mocap))}, which stands where the file puts it")
     for name in ("camera", "sensor"):
