@@ -124,7 +124,9 @@ def test_missing_meshes_matter_only_for_masses(tmp_path):
     world += f'<body name="b"><freejoint/>{INERTIA}{mesh}<geom type="box" mesh="m"/></body>'
     world += '<body><freejoint/><geom size=".1" mass="2"/><geom type="mesh" mesh="m" density="0"/></body>'
     world += '<body><body><geom type="mesh" mesh="m"/></body></body>'
-    with pytest.warns(UserWarning, match=r"left out: the meshes .* of 6 geoms, with which MuJoCo"):
+    with pytest.warns(
+        UserWarning, match=r"left out: the pictures of 1 textures, the meshes .* of 6 geoms, with which MuJoCo"
+    ):
         scene = spo.load(written(tmp_path, before=asset, world=world, after=tail))
     np.testing.assert_array_equal(scene.values["body_mass"], [[1.0, 2.0, 0.0, 0.0]])
     file = written(tmp_path, before=asset, world=f'<body name="b"><freejoint/>{mesh}</body>')

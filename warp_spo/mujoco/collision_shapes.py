@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import Any
 
 import mujoco
@@ -71,6 +72,34 @@ def _touches(source: Source, geom: int, ground: int, pairs: Pairs) -> bool:
     if (body << 16) + other in m.exclude_signature.tolist() or (other << 16) + body in m.exclude_signature.tolist():
         return False
     return bool(m.geom_contype[geom] & m.geom_conaffinity[ground] | m.geom_contype[ground] & m.geom_conaffinity[geom])
+
+
+def touching_bodies(source: Source, moving: np.ndarray) -> tuple[int, int] | None:
+    """Return two geoms, of two bodies that move, that MuJoCo lets touch each other; None where there are none.
+
+    Explicit pairs count, then masks, by MuJoCo's rules: not of one rigid piece, nor of a piece and its parent, unless
+    the file disables ``filterparent``, nor of bodies that ``<exclude>`` names.
+    """
+    m, piece = source.model, np.array(source.model.body_weldid)
+    above = piece[m.body_parentid[piece]]
+    moves = np.concatenate([[False], moving[: m.nbody - 1]])[m.geom_bodyid]
+    for one, other in ((int(a), int(b)) for a, b in zip(m.pair_geom1, m.pair_geom2, strict=True)):
+        if moves[one] and moves[other] and piece[m.geom_bodyid[one]] != piece[m.geom_bodyid[other]]:
+            return one, other
+    excluded = {frozenset(divmod(int(pair), 1 << 16)) for pair in m.exclude_signature}
+    kinds: dict[tuple[int, int], dict[int, int]] = {}  # by masks: a geom of each body
+    for geom in np.flatnonzero((m.geom_contype | m.geom_conaffinity).astype(bool) & moves):
+        masks = int(m.geom_contype[geom]), int(m.geom_conaffinity[geom])
+        kinds.setdefault(masks, {}).setdefault(int(m.geom_bodyid[geom]), int(geom))
+    for (a, b), (c, d) in itertools.combinations_with_replacement(kinds, 2):
+        if not (a & d or b & c):
+            continue
+        for one, other in itertools.product(kinds[a, b], kinds[c, d]):  # all but a few of them may touch: soon found
+            first, second = int(piece[one]), int(piece[other])
+            related = not source.disabled("FILTERPARENT") and (above[one] == second or above[other] == first)
+            if first != second and not related and frozenset((one, other)) not in excluded:
+                return kinds[a, b][one], kinds[c, d][other]
+    return None
 
 
 def _friction(source: Source, geom: int, ground: int | None, pairs: Pairs) -> float:

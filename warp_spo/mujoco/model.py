@@ -14,7 +14,7 @@ from ..scene.actuators import Keyframe
 from ..scene.collision_shapes import NONE, POINTS, ShapeSelection, moving_bodies
 from ..scene.scene import Scene
 from .actuators import read_actuators
-from .collision_shapes import SOFTNESS, collision_shapes
+from .collision_shapes import SOFTNESS, collision_shapes, touching_bodies
 from .equality_constraints import read_equality_constraints
 from .mechanism import BALL, FREE, SIZES, Mechanism, rotation, scene_entries, xyzw
 from .source import Source
@@ -80,9 +80,11 @@ def scene_of(source: Source, floating: bool | None, selection: ShapeSelection = 
     except ValueError as error:  # of a body, a hinge or the scene, which know neither call nor file
         raise ValueError(f"{source.title}: {error}; correct the model") from None
     selection, disabled = selection.unless(source.disabled("CONTACT") or source.disabled("CONSTRAINT"))
-    shapes = lambda: collision_shapes(source, moving_bodies(scene))  # noqa: E731
-    scene, lost = selection.apply(source.title, scene, shapes, complete=True)
+    moving = moving_bodies(scene)
+    scene, lost = selection.apply(source.title, scene, lambda: collision_shapes(source, moving), complete=True)
     source.left_out += disabled + lost
+    if selection.contacts is not None:
+        source.left_out += _lost_pairs(source, moving)
     _warn(source, selection.contacts is not None)
     return scene
 
@@ -168,11 +170,20 @@ def _listed(source: Source, kind: str, indices: np.ndarray) -> str:
     return ", ".join(source.words(kind, int(index)) for index in indices[:8]) + more
 
 
+def _lost_pairs(source: Source, moving: np.ndarray) -> list[str]:
+    """Return in words that bodies which touch each other in MuJoCo do not here, nothing if there are none."""
+    found = touching_bodies(source, moving)
+    if found is None:
+        return []
+    words = " with ".join(source.words("geom", geom) for geom in found)
+    return [f"contacts between bodies, such as {words} (spo.Contact(other=) adds the pairs that matter)"]
+
+
 def _warn(source: Source, touches: bool) -> None:
     """Warn of what the scene does not hold, all of it in one message; ``touches``: it has the source's contacts."""
     m = source.model
     found = list(source.left_out)
-    solid = np.flatnonzero(m.geom_contype | m.geom_conaffinity)
+    solid = np.union1d(np.flatnonzero(m.geom_contype | m.geom_conaffinity), [*m.pair_geom1, *m.pair_geom2]).astype(int)
     if solid.size and not touches and not source.disabled("CONTACT") and not source.disabled("CONSTRAINT"):
         planes = [source.words("geom", int(geom)) for geom in solid if m.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE]
         among = f", {', '.join(planes)} among them" if planes else ""
