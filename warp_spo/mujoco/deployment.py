@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from ..errors import shown
+from .mjcf import one_line
 
 LEAST_COMMAND = 0.05  # [m/s and rad/s, added up] below which the clock of steps stands, as that of the tasks
 
@@ -45,6 +46,7 @@ class Deployment:
         self, policy: str | Path, robot: str | Path | mujoco.MjSpec, worlds: int, friction: float = 0.8, seed: int = 0
     ):
         self.network, found = load_policy(policy)
+        check_metadata(policy, found)
         self.metadata: dict[str, Any] = found
         if found.get("default_base", "older") is None:
             raise ValueError(f"Deployment: {str(policy)!r} is of a robot on a fixed base; expected one that floats")
@@ -52,8 +54,8 @@ class Deployment:
         if unknown or max(found.get("observation_history", [1])) > 1:
             seen = ", ".join(map(shown, unknown)) or "past steps"
             raise ValueError(
-                f"Deployment: {str(policy)!r} is of task {found['task']!r}, which observes {seen}; expected one that "
-                f"tracks velocities, with observations among {', '.join(OBSERVED)}"
+                f"Deployment: {str(policy)!r} is of task {found.get('task')!r}, which observes {seen}; expected one "
+                f"that tracks velocities, with observations among {', '.join(OBSERVED)}"
             )
         spec = robot if isinstance(robot, mujoco.MjSpec) else mujoco.MjSpec.from_file(str(robot))
         complete(spec, found)
@@ -91,6 +93,12 @@ class Deployment:
                 f"Deployment: {str(policy)!r} takes {size} observations, and its terms give {seen} here; expected "
                 "terms of all joints, without names of some"
             )
+        try:
+            came = np.shape(self.network(self.observe()))
+        except Exception as error:  # of its operators
+            raise _unread(policy, f"cannot be evaluated ({type(error).__name__}: {one_line(error)})") from None
+        if came != self.last.shape:
+            raise _unread(policy, f"gives actions of shape {came}, where its actuators ask for {self.last.shape}")
 
     def _start(self, data: mujoco.MjData) -> None:
         """Stand a robot up in a random direction, its joints within 0.1 rad of where episodes start."""
@@ -188,18 +196,67 @@ def complete(spec: mujoco.MjSpec, found: dict[str, Any]) -> None:
 
 
 def load_policy(file: str | Path) -> tuple[Any, Any]:
-    """Return the function from observations to actions of an ONNX file, and its metadata."""
+    """Return the function from observations to actions of an ONNX file, and its metadata.
+
+    Raises:
+        ValueError: onnx cannot read the file, or a text of its metadata is not JSON.
+    """
     import onnx
     from onnx.reference import ReferenceEvaluator
 
-    model = onnx.load(str(file))
-    metadata = {each.key: json.loads(each.value) for each in model.metadata_props}
-    network = ReferenceEvaluator(model)
+    try:
+        model = onnx.load(str(file))
+        metadata = {each.key: json.loads(each.value) for each in model.metadata_props}
+        network = ReferenceEvaluator(model)
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # of protobuf, onnx's checks of files beside it, its operators, JSON
+        raise _unread(file, f"cannot be read ({type(error).__name__}: {one_line(error)})") from None
 
     def run(observations: np.ndarray) -> Any:
         return network.run(None, {"obs": observations})[0]  # type: ignore[index]
 
     return run, metadata
+
+
+LISTS = ("joints", "actuators"), ("default_position", "action_offset", "action_scale", "delay_steps")
+MOST_STEPS = 10_000  # of the dynamics, in a step of a policy or a delay: files that ask for more are damaged
+
+
+def check_metadata(file: str | Path, found: dict[str, Any]) -> None:
+    """Raise ValueError if metadata lack what a :class:`Deployment` needs, or hold it in another form."""
+    whole = lambda value, least: isinstance(value, int) and least <= value <= MOST_STEPS  # noqa: E731
+    names, numbers = LISTS
+    for key in names:
+        if not isinstance(found.get(key), list) or not all(isinstance(name, str) for name in found[key]):
+            raise _unread(file, f"has no list of names {key!r} in its metadata")
+    for key in numbers:
+        count = len(found["joints" if key == "default_position" else "actuators"])
+        values = found.get(key)
+        if not isinstance(values, list) or len(values) != count or not all(map(_is_number, values)):
+            raise _unread(file, f"has no list of {count} numbers {key!r} in its metadata")
+    if not all(whole(steps, 0) for steps in found["delay_steps"]) or not whole(found.get("decimation"), 1):
+        raise _unread(file, f"has 'delay_steps' or 'decimation' that are not whole numbers up to {MOST_STEPS}")
+    if not _is_number(found.get("dt")) or found["dt"] <= 0.0:
+        raise _unread(file, "has no step 'dt' above zero in its metadata")
+    listed = found.get("observations", "")
+    if (
+        not isinstance(listed or [], list)
+        or listed == ""
+        or not all(
+            isinstance(one, list) and len(one) == 3 and isinstance(one[0], str) and _is_number(one[2])
+            for one in listed or []
+        )
+    ):
+        raise _unread(file, "has no list of 'observations' with a name, a size and a scale each in its metadata")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and bool(np.isfinite(float(value)) if abs(value) < 1e300 else False)
+
+
+def _unread(file: str | Path, what: str) -> ValueError:
+    return ValueError(f"Deployment: {str(file)!r} {what}; expected an ONNX file of warp_spo.env.export")
 
 
 def trial(deployment: Deployment, seconds: float = 20.0, period: float = 5.0, still: float = 1.0) -> dict[str, float]:

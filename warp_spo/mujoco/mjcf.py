@@ -45,7 +45,7 @@ def compiled(file: Path) -> tuple[mujoco.MjModel, list[str], dict[int, str]]:
     try:
         return mujoco.MjModel.from_xml_path(os.fspath(file)), [], {}
     except REFUSALS as error:
-        refusal = _one_line(error)
+        refusal = one_line(error)
     for unneeded in (UNNEEDED, (*UNNEEDED, *OF_CONTACT)):
         try:
             spec = mujoco.MjSpec.from_file(os.fspath(file))
@@ -56,7 +56,7 @@ def compiled(file: Path) -> tuple[mujoco.MjModel, list[str], dict[int, str]]:
             continue
         missing = {int(geom.id): kind for geom, kind in shapeless}
         return model, [f"{', '.join(dropped)}, with which MuJoCo refuses the file ({refusal})"], missing
-    raise ValueError(f"load: {str(file)!r}: MuJoCo refuses it: {_one_line(last)}; correct the file") from None
+    raise ValueError(f"load: {str(file)!r}: MuJoCo refuses it: {one_line(last)}; correct the file") from None
 
 
 MOST_LETTERS = 1000  # of MuJoCo's messages, which hold names of the file
@@ -119,5 +119,6 @@ def _gives_no_mass(spec: Any, geom: Any) -> bool:
     return True
 
 
-def _one_line(error: Exception) -> str:
+def one_line(error: Exception) -> str:
+    """Return an error's message in one line that prints, cut where it is long."""
     return shown(" ".join(str(error).split()), MOST_LETTERS)
