@@ -17,8 +17,9 @@ SQUARES = {wp.float32: (1e-30, 1e38), wp.float64: (1e-290, 1e307)}
 def check_results(T: type) -> wp.Kernel:
     """Set ``word`` in worlds with a result that is not finite, and RANGE where q is beyond a reduction's reach.
 
-    A world whose status is more severe keeps it. Arrays are those that a call has written, [world, ...], or None. A gap
-    may be infinite. ``kinds`` [coordinate] is ANGLE, ROTATION or 0.
+    NOT_FINITE and QUATERNION stay; so do other words as severe where results alone are the matter. Arrays are those
+    that a call has written, [world, ...], or None. A gap may be infinite. ``kinds`` [coordinate] is ANGLE, ROTATION
+    or 0.
     """
     least, most = (T(x) for x in SQUARES[T])
 
@@ -71,8 +72,11 @@ def check_results(T: type) -> wp.Kernel:
     ):
         world = wp.tid()
         known = status_out[world]
-        severe = known == NOT_FINITE or known == PIVOT or known == QUATERNION
-        if not severe and known != RANGE and known != wp.static(LOOPS):
+        if known == NOT_FINITE or known == QUATERNION:
+            return
+        if not within_reach(q, kinds, world):
+            status_out[world] = RANGE
+        elif known != PIVOT and known != RANGE and known != wp.static(LOOPS):
             fine = finite_row(q_after, world) and finite_row(rates, world) and finite_row(qdd, world)
             fine = fine and finite_row(slip, world) and finite_row(excess, world)
             fine = fine and finite_rows(force, world)
@@ -84,8 +88,6 @@ def check_results(T: type) -> wp.Kernel:
                     fine = fine and not wp.isnan(gap[world, i])
             if not fine:
                 status_out[world] = word
-            elif not within_reach(q, kinds, world):
-                status_out[world] = RANGE
 
     return kernel
 

@@ -45,13 +45,15 @@ def test_angles_beyond_their_reduction_have_a_word(dtype, device):
 
 def test_quaternions_whose_squares_leave_the_dtype_have_a_word(device):
     """One of norm 3e19 was read as no rotation; one of norm 1e10 is normalised as any other. Vanishing ones are NaN."""
-    scene = spo.Scene([LEVER], [spo.Hinge("ball", -1, 0)])
-    q = np.float32(np.array([[0.0, 0.0, 0.6, 0.8]]) * np.array([[1.0], [1e10], [3e19], [1e-16]]))
-    dyn, status = spo.Dynamics(scene, 4, device=device, dtype="float32"), np.stack([words(4), words(4)])
-    qdd = dyn.forward_dynamics(q, status=status[0])
-    dyn.step(q, np.zeros((4, 3)), None, 1e-3, status=status[1])
-    np.testing.assert_array_equal(status, [[0, 0, spo.Status.RANGE, spo.Status.RANGE]] * 2)
-    np.testing.assert_allclose(qdd[0], qdd[1], rtol=1e-6)
+    for kind, first in (("ball", 0), ("free", 3)):
+        scene = spo.Scene([LEVER], [spo.Hinge(kind, -1, 0)])
+        q = np.zeros((4, first + 4), np.float32)
+        q[:, first:] = np.array([[0.0, 0.0, 0.6, 0.8]]) * np.array([[1.0], [1e10], [3e19], [1e-16]])
+        dyn, status = spo.Dynamics(scene, 4, device=device, dtype="float32"), np.stack([words(4), words(4)])
+        qdd = dyn.forward_dynamics(q, status=status[0])
+        dyn.step(q, np.zeros((4, scene.dof_count)), None, 1e-3, status=status[1])
+        np.testing.assert_array_equal(status, [[0, 0, spo.Status.RANGE, spo.Status.RANGE]] * 2)
+        np.testing.assert_allclose(qdd[0], qdd[1], rtol=1e-6)
 
 
 @pytest.mark.parametrize("substeps", [1, 2])

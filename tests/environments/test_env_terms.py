@@ -213,6 +213,16 @@ def test_actions_obey_the_effort_limit(action):
         np.testing.assert_allclose(observed[:, 2], env.dt * expected * np.linalg.inv(M)[0, 0], rtol=1e-3)
 
 
+def test_a_shared_effort_limit_leaves_no_force_of_each():
+    """What a drive and an actuator give together is bounded in the step, so their forces apart are refused."""
+    scene = limited_cart().with_values(joint_target_ke=[10.0, 0.0])
+    with pytest.raises(ValueError, match=r"World.joint_force: joint 'slide' has a drive and an actuator that share"):
+        cart_env(
+            2, actions=[actions.Position("slide"), actions.Control()], scene=scene,
+            observations={"actor": [lambda w: w.joint_force]},
+        )  # fmt: skip
+
+
 def test_exported_scales_are_those_below_the_effort_limit():
     """Scale and offset are measured; a push of half an action is beyond the limit."""
     export = pytest.importorskip("warp_spo.env.export")

@@ -10,7 +10,7 @@ from warp_spo.reference.dense import Dense
 from warp_spo.reference.rotations import homogeneous, pose7
 
 DT = 1e-2
-FAR = spo.Contact(1, sphere=((0.0, 0.0, 0.0), 0.01))
+FAR = spo.Contact(0, sphere=((0.0, 0.0, 0.0), 0.01))  # of the parent: one of the body would keep its rates
 
 
 def carried(parent, contacts=()):
@@ -91,3 +91,22 @@ def test_gradients_know_how_it_is_carried(device):
         along, h = rng.normal(size=array.shape), 1e-5
         slope = (value(**{**state, name: array + h * along}) - value(**{**state, name: array - h * along})) / (2.0 * h)
         assert laws.error((given[name].grad.numpy() * along).sum(), slope[0]) <= 1e-8
+
+
+@pytest.mark.parametrize("law", [dict(stiffness=1e6, damping=1e3), dict(target_ke=1e6, target_kd=1e3)])
+def test_stiff_laws_of_its_hinge_hold_it(law, device):
+    """On a fast turntable, w h = 0.3, a spring's deflection is that of the centrifugal force, m r w^2 / k."""
+    mass, radius, speed = 1.0, 0.5, 30.0
+    bodies = [spo.Body(mass, inertia=0.01 * np.eye(3)) for _ in range(2)]
+    hinges = [
+        spo.Hinge("revolute", -1, 0, axis=(0, 0, 1), armature=1e6),
+        spo.Hinge("free", 0, 1, parent_pose=(radius, 0, 0, 0, 0, 0, 1), **law),
+    ]
+    scene = spo.Scene(bodies, hinges, gravity=(0, 0, 0))
+    dyn = spo.Dynamics(scene, 1, device=device, dtype="float64")
+    q, qd = scene.neutral_q[None], np.eye(1, scene.dof_count) * speed
+    for _ in range(100):
+        q, qd = dyn.step(q, qd, None, DT)
+    np.testing.assert_allclose(
+        q[0, 1:4], [mass * radius * speed**2 / 1e6, 0.0, 0.0], atol=5e-6
+    )  # it turns by w h a step

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ..errors import shown
 from ..recursions.contact.ground import GroundOffset, height
+from ..recursions.step.joint_laws import DEFAULT_BOUND
 from ..trace import spatial
 from ..trace.functions import AbstractScalar, clip, where
 from ..trace.scalars import floor, lookup
@@ -233,13 +235,17 @@ class World:
 
     @property
     def joint_force(self) -> Vector:
-        """Force of actuators, drives and efforts, as actions command, in the state after the step [dof] [N m or N]."""
+        """Force of actuators, drives and efforts, as actions command, in the state after the step [dof] [N m or N].
+
+        Raises:
+            ValueError: a drive and an actuator of a joint share its effort limit: how much each gives is not known.
+        """
         arrays, count = self._layout.action_arrays, self.scene.dof_count
         total = vector(0.0 for _ in range(count))
-        actuators = self.read("actuator_force", count) if "ctrl" in arrays else total
-        acted = {int(self.scene.qd_start[hinge]) for each in self.scene.actuators for hinge in each.hinges}
+        acted: set[int] = set()
         if "ctrl" in arrays:
-            total = total + actuators
+            total = total + self.read("actuator_force", count)
+            acted = {int(self.scene.qd_start[hinge]) for each in self.scene.actuators for hinge in each.hinges}
         if "tau" in arrays:
             total = total + self.read("tau", count)
         if "target_q" in arrays:
@@ -249,10 +255,15 @@ class World:
                 i, j = int(self.scene.q_start[hinge]), int(self.scene.qd_start[hinge])
                 limit = as_scalar(most[j])
                 force = as_scalar(ke[j]) * (target[i] - self.q[i]) - as_scalar(kd[j]) * self.qd[j]
-                if "ctrl" in arrays and j in acted:  # the limit is that of both together
-                    total[j] = total[j] + clip(force + actuators[j], -limit, limit) - actuators[j]
-                else:
-                    total[j] = total[j] + clip(force, -limit, limit)
+                unlimited = not isinstance(most[j], AbstractScalar) and most[j] >= DEFAULT_BOUND
+                without_drive = not isinstance(ke[j], AbstractScalar) and ke[j] == 0.0
+                if j in acted and not unlimited and not without_drive:
+                    label = shown(self.scene.joint_labels[hinge])
+                    raise ValueError(
+                        f"World.joint_force: joint {label!r} has a drive and an actuator that share its effort limit; "
+                        "expected one of them; set its joint_target_ke to zero, or joint_effort_limit=1e6"
+                    )
+                total[j] = total[j] + clip(force, -limit, limit)
         return total
 
     # -- ground ----------------------------------------------------------------------------------------------------

@@ -5,6 +5,9 @@ of the step alone, they miss what the parent turns and speeds up meanwhile: of a
 a step, in proportion to the parent's speed. So the body moves as a free body without a parent does, v' = v + h a in
 inertial axes and its pose along v'; rates and coordinates follow from the parent's state after the step. A body on
 which nothing acts stays at rest, whatever its parent does.
+
+Where a law of the hinge or a contact acts on the body or on what it carries, it stays as it is: those are solved for
+the rates relative to the parent, and would act on a state that the step does not take.
 """
 
 from __future__ import annotations
@@ -21,10 +24,12 @@ from ..kinematics import NEUTRAL, relative_quaternion
 from ..model.links import Link, place_link
 from ..motion import STILL, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
+from .joint_laws import DEFAULT_BOUND
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace
 
+LAWS = tuple(f"joint_{law}" for law in ("stiffness", "damping", "friction", "target_ke", "target_kd"))
 Entry = Callable[[int], Value]
 Entries = dict[int, Value]
 
@@ -46,21 +51,34 @@ class InertialLink(NamedTuple):
 GROUND = InertialLink(IDENTITY, NEUTRAL, ZERO, ZERO, ZERO)
 
 
-def is_free_descendant(link: Link) -> bool:
-    """Return whether a link is free and its parent moves."""
-    return link.hinge.unconstrained and link.parent is not None
+def free_descendants(scene: Scene, variable: tuple[str, ...] = ()) -> set[int]:
+    """Return the first dofs of the free hinges on bodies that move, on which neither laws nor contacts act.
+
+    Args:
+        variable: names of values that may differ from the scene's.
+    """
+    inner = {hinge.child: hinge for hinge in scene.hinges}
+
+    def path(body: int) -> Iterator[int]:
+        while body >= 0:
+            yield body
+            body = inner[body].parent
+
+    touched = {body for contact in scene.contacts for one in (contact, contact.other) if one for body in path(one.body)}
+    found = set()
+    for hinge, first in zip(scene.hinges, scene.qd_start, strict=False):
+        dofs = slice(first, first + hinge.dof_count)
+        moves = hinge.unconstrained and any(inner[body].dof_count for body in path(hinge.parent))
+        if moves and hinge.child not in touched:
+            has_laws = any(name in variable or scene.values[name][:, dofs].any() for name in LAWS)
+            has_laws |= bool((scene.values["joint_velocity_limit"][:, dofs] < DEFAULT_BOUND).any())
+            found |= set() if has_laws else {int(first)}
+    return found
 
 
 def has_free_descendants(scene: Scene) -> bool:
-    """Return whether a free hinge of a scene is on a body that moves."""
-    inner = {hinge.child: hinge for hinge in scene.hinges}
-
-    def moves(body: int) -> bool:
-        while body >= 0 and inner[body].dof_count == 0:
-            body = inner[body].parent
-        return body >= 0
-
-    return any(hinge.unconstrained and moves(hinge.parent) for hinge in scene.hinges)
+    """Return whether a step of a scene may have to carry free bodies on links that move."""
+    return bool(free_descendants(scene))
 
 
 def states_after(
@@ -70,10 +88,11 @@ def states_after(
 
     Args:
         links: leaders, parents first. q, qd: the state before the step.
-        carries: free bodies on links that move are carried as said above; otherwise their rates are those given.
+        carries: free bodies on links that move are carried, as said above; otherwise their rates are those given.
     """
     q_after, qd_after = Entries(), dict(rates)
-    carried = {id(link) for link in links if carries and is_free_descendant(link)}
+    free = free_descendants(trace.links.scene, trace.links.variable) if carries else set()
+    carried = {id(link) for link in links if free.intersection(link.dofs)}
     gains = {dof: rate - qd(dof) for dof, rate in rates.items()} if carried else {}
     for link in links:
         trace.label(link, "q")

@@ -149,7 +149,9 @@ def limit_sum(laws: list[Law], bound: Value) -> list[Law]:
         return []
     loose, own = add_laws([law for law in laws if not law.has_bounds]), [law for law in laws if law.has_bounds]
     if len(own) == 1 and is_number(loose.resistance, 0.0):
-        return [_share(own[0], loose.force, bound), *([] if is_number(loose.force, 0.0) else [loose])]
+        law = own[0]  # of a motor without strength the others keep the bound alone
+        force = select(less(LEAST_SCALE, law.scale), loose.force, clip(loose.force, -bound, bound))
+        return [_share(law, force, bound), *([] if is_number(force, 0.0) else [loose._replace(force=force)])]
     whole = add_laws([loose, *(law.piece(0.0) for law in own)]) if own else loose
     if is_number(whole.resistance, 0.0):
         return [whole._replace(force=clip(whole.force, -bound, bound))]
