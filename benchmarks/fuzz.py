@@ -2,6 +2,7 @@
 
     python -m benchmarks.fuzz urdf --minutes 10
     python -m benchmarks.fuzz mjcf --minutes 10 --first 100000
+    python -m benchmarks.fuzz usd --minutes 10                  # texts, .usda
     python -m benchmarks.fuzz mjcf --seed 812 --keep FOLDER     # one file again; it is written into the folder
 
 A seed chooses an installed file of the format, damages it in one to three places and chooses the options of the call. A
@@ -34,15 +35,21 @@ import numpy as np
 
 import warp_spo as spo
 
-from .robot_files import mjcf_files, urdf_files
+from .robot_files import mjcf_files, urdf_files, usd_files
 
 MEMORY = 8 << 30  # [bytes] of the process that reads
 LARGEST = 40_000  # [bytes] of a file that is damaged; larger ones take long to read
 LONGEST_MESSAGE = 4000  # characters
 NUMBER = re.compile(rb"(?<![\w.])-?\d+\.?\d*(?:[eE][-+]?\d+)?")
 QUOTED = re.compile(rb'"[^"]*"')
-ELEMENT = re.compile(rb"<(\w+)[^<>]*/>|<(\w+)[^<>]*>(?:(?!<\2\b).)*?</\2>", re.S)
-ATTRIBUTE = re.compile(rb'\s[\w:]+\s*=\s*"[^"]*"')
+ELEMENT = re.compile(
+    rb"<(\w+)[^<>]*/>|<(\w+)[^<>]*>(?:(?!<\2\b).)*?</\2>"  # of XML
+    rb"|\b(?:def|over|class) [^{}]*\{[^{}]*\}",  # a prim of USD without children
+    re.S,
+)
+ATTRIBUTE = re.compile(
+    rb'\s[\w:]+\s*=\s*"[^"]*"|\n[ \t]*(?:(?:uniform|custom|prepend) )*[\w\[\]]+ [\w:.]+ = [^\n]*'  # of XML, of USD
+)
 WORD = re.compile(rb"[A-Za-z_]\w+")
 NUMBERS = b"0 -0 -1 2 nan inf -inf 1e-320 1e30 1e200 1e308 1e999 99999999999 1_000 0x10 1.2.3 - 1,5".split()
 STRINGS = (
@@ -82,6 +89,7 @@ OWN = Path(spo.__file__).parent / "env" / "robots"  # MJCF files of the tasks
 FORMATS = {
     "urdf": Format(".urdf", lambda: small(urdf_files())),
     "mjcf": Format(".xml", lambda: small((*(file for _, file in mjcf_files()), *OWN.glob("*.xml")), b"<include")),
+    "usd": Format(".usda", lambda: small(file for file in usd_files() if file.suffix == ".usda")),
 }
 
 

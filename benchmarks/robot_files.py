@@ -293,12 +293,16 @@ def compare_usd(file: Path) -> UsdRow:
     )
 
 
-def usd_rows(pattern: str = "") -> Iterator[UsdRow]:
-    """Yield a row for each USD of Newton that has rigid bodies and whose path matches an expression."""
+def usd_files() -> list[Path]:
+    """Return the USD files of Newton."""
     import newton
 
-    files = sorted(Path(newton.__file__).parent.rglob("*.usd*"))
-    rows = (compare_usd(file) for file in files if re.search(pattern, str(file)))
+    return sorted(Path(newton.__file__).parent.rglob("*.usd*"))
+
+
+def usd_rows(pattern: str = "") -> Iterator[UsdRow]:
+    """Yield a row for each USD of Newton that has rigid bodies and whose path matches an expression."""
+    rows = (compare_usd(file) for file in usd_files() if re.search(pattern, str(file)))
     yield from (row for row in rows if "has no rigid bodies" not in row.note)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import shown
 from ..recursions.step.joint_laws import DEFAULT_BOUND, FREE
 from ..scene.scene import Scene
 from ..trace.functions import AbstractScalar, clip, where
@@ -163,7 +164,9 @@ def spread(call: str, name: str, value: Any, labels: list[str]) -> np.ndarray:
             out[find(f"actions.{call}", "label", labels, pattern)] = number
         if np.isnan(out).any():
             left = [label for label, number in zip(labels, out, strict=True) if np.isnan(number)]
-            raise ValueError(f"actions.{call}: {name} has no number for {', '.join(left)}; add an expression for them")
+            raise ValueError(
+                f"actions.{call}: {name} has no number for {', '.join(map(shown, left))}; add an expression for them"
+            )
     else:
         try:
             out = np.asarray(value, dtype=np.float64)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import shown
 from ..trace.functions import Condition, clip, where
 from .compile.vectors import Vector, vector
 from .validation import Range, check_interval, check_number, check_optional_span, check_span
@@ -38,7 +39,9 @@ class Level:
         if LEVEL in w.kept:
             return self.first + w.kept[LEVEL][0]
         if self.reward not in w.weights:
-            raise ValueError(f"commands.Level: no reward {self.reward!r}; expected one of {', '.join(w.weights)}")
+            raise ValueError(
+                f"commands.Level: no reward {self.reward!r}; expected one of {', '.join(map(shown, w.weights))}"
+            )
         level = self.first + w.memory(LEVEL, 1, reset=None)[0]
         if done is None:
             return level

@@ -12,6 +12,7 @@ import warp as wp
 
 from ..dynamics.dynamics import Dynamics
 from ..dynamics.stepping.options import StepOptions, StepReport
+from ..errors import shown
 from ..execution.device_facts import read_facts
 from ..recursions.contact.ground import GROUND, SINGLE
 from ..runtime.arrays import parse_device
@@ -193,7 +194,9 @@ class Env(VecEnv):
     def memory(self, name: str) -> torch.Tensor:
         """Return what worlds remember under a name, such as "command", as a tensor that may be written [world, n]."""
         if name not in self._layout.memory:
-            raise ValueError(f"Env.memory: unknown name {name!r}; expected one of {', '.join(self._layout.memory)}")
+            raise ValueError(
+                f"Env.memory: unknown name {name!r}; expected one of {', '.join(map(shown, self._layout.memory))}"
+            )
         start, size, _ = self._layout.memory[name]
         return self._tensors["memory"][start : start + size].t()
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..errors import shown
 from . import arguments, checkpoint
 from .environment import Env
 
@@ -192,7 +193,7 @@ def make_skrl(env: Env, observations: str | None = None, states: str | None = No
     whole = states or (groups[1] if len(groups) > 1 and observations is None else None)
     for name in (own, whole):
         if name is not None and name not in groups:
-            raise ValueError(f"env.skrl: unknown group {name!r}; expected one of {', '.join(groups)}")
+            raise ValueError(f"env.skrl: unknown group {name!r}; expected one of {', '.join(map(shown, groups))}")
     box = _spaces(env)[1]
 
     class SkrlWorlds(Wrapper):

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import shown
 from ..trace.functions import clip, where
 from .compile.fused_kernel import ROW_NUMBER
 from .compile.vectors import Vector, rotate, rotate_back, vector
@@ -118,7 +119,9 @@ class Observation:
         """Return the number of a row of the thread."""
         value = self._measurement(w, self.term.of_own_row(w, number))  # type: ignore[attr-defined]
         if w.kept:
-            raise ValueError(f"observations.Each: {self.term.function} keeps {', '.join(w.kept)}; expected nothing")  # type: ignore[attr-defined]
+            function = self.term.function  # type: ignore[attr-defined]
+            kept = ", ".join(map(shown, w.kept))
+            raise ValueError(f"observations.Each: {function} keeps {kept}; expected nothing")
         return value
 
     def _measurement(self, w: World, x: Any) -> Any:

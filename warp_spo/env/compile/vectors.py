@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ...errors import shown
 from ...trace.functions import AbstractScalar, Condition, where
 from ...trace.scalars import Value, is_constant
 
@@ -72,7 +73,9 @@ def find(call: str, what: str, labels: Sequence[str], names: Any) -> list[int]:
             if pattern.fullmatch(label) or pattern.fullmatch(end)
         }
         if not hits:
-            raise ValueError(f"{call}: {pattern.pattern!r} matches no {what}; expected one of {', '.join(labels)}")
+            raise ValueError(
+                f"{call}: {pattern.pattern!r} matches no {what}; expected one of {', '.join(map(shown, labels))}"
+            )
         found |= hits
     return sorted(found)
 
