@@ -38,7 +38,7 @@ IMPEDANCES = (DEFAULT, ".99 .99 .01", ".95 .99 .001", "0 .99 .1", ".5 .9 .01 .3 
 ARM = """<mujoco><option timestep="{dt}" gravity="0 0 {gravity}"/><worldbody><body euler="10 20 30"><joint {joint}
  limited="true" solreflimit="{ref}" solimplimit="{imp}" armature=".01"/>
  <geom type="capsule" size=".03" fromto=".1 .2 0 .6 .2 .1"/></body></worldbody></mujoco>"""
-STEPS = 20_000  # of MuJoCo at most
+STEPS = 80_000  # of MuJoCo at most
 AT_REST = 1e-7  # [rad/s or m/s]
 
 
