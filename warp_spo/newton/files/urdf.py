@@ -46,8 +46,9 @@ LIMIT_WARNINGS = {
     "scene.with_values(joint_limit_lower=..., joint_limit_upper=...)",
     "unread": "left out: the <limit> of joints {}, which are planar, floating or spherical; "
     "pass limits of their degrees of freedom to scene.with_values",
+    "safety": "left out: the <safety_controller> of joints {}, which bounds what a controller commands; bound it there",
 }
-"""Words about joints whose <limit> stops them, or is not read."""
+"""Words about joints whose <limit> stops them, and whose <limit> or <safety_controller> is not read."""
 NO_LIMITS: dict[str, Any] = {"limit_ke": 0.0, "limit_kd": 0.0}  # of free and ball hinges, as in Newton
 QUARTER = np.pi / 2
 TYPED = 5e-10  # an angle this close to a multiple of a quarter turn [rad] is one that was written with ten digits
@@ -294,7 +295,11 @@ def _warn_of_limits(joints: list[XmlElement], held: Container[int]) -> None:
     found: dict[str, list[str]] = {name: [] for name in LIMIT_WARNINGS}
     for index, joint in enumerate(joints):
         limit, kind = joint.child("limit"), joint.get("type")
-        if limit is None or kind == "fixed" or index in held:
+        if kind == "fixed" or index in held:
+            continue
+        if joint.find("safety_controller") is not None:
+            found["safety"].append(str(joint.get("name")))
+        if limit is None:
             continue
         given = {name: limit.number(name, infinite=True) for name in LIMITS if limit.get(name) is not None}
         if kind not in SCALAR:
