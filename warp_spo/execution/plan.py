@@ -242,6 +242,15 @@ class Plan:
         """
         return self.device.cuda and self.latency_bound and self.of(routine) != "node"
 
+    @property
+    def loops_over_links(self) -> bool:
+        """Whether statements of links that are alike stand once in a traced kernel, see :mod:`..trace.equal_blocks`.
+
+        They do on a CPU where there are so many dofs that a kernel in which they stand for each link takes long to
+        compile. A GPU would hold what the loops keep in local memory, for all threads at once.
+        """
+        return self.dofs > MOST_DOFS and not self.device.cuda
+
     def column_chunk(self, columns: int, bytes_per_column: int) -> int:
         """Right-hand sides that go through a solve at once."""
         return max(1, min(columns, COLUMN_BYTES // max(1, bytes_per_column)))

@@ -15,7 +15,8 @@ from ..recursions.model.links import Links
 from ..recursions.model.tracing import Trace
 from ..recursions.step.phases import as_phases
 from ..recursions.step.step import GAIN, LOOPED
-from ..trace.emission import Store, render
+from ..trace import equal_blocks
+from ..trace.emission import C_TYPE, Store, render
 from . import staging
 from .array_access import make_emitter
 from .builder import PASSED, Builder, Job, Program, flatten
@@ -28,6 +29,7 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
     run, plan, dtype = builder.run, builder.plan, builder.dtype
     routine, shapes, more, options = job
     trace = Trace(links, dtype, tuple(shapes))
+    links.graph.apart = plan.loops_over_links and not run.scene.contact_pairs
     phases = as_phases(routine.trace(trace, **options))
     stores = [flatten(item, shapes) for item in phases.stores]
     apart = [item for item in stores if item.array in more]  # each straight to memory
@@ -44,8 +46,14 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
     responses = [item for item in stores if item.array in pairs.READ]
     regions = [emitter.region(phases.prologue, phases.pass_invariants)] if looped else []
     regions += emitter.branches([responses, looped] if responses else [looped]) if looped else []
-    *before, body = (render(each, dtype) for each in [*regions, emitter.region(placed)])
+    listings = [*regions, emitter.region(placed)]
     tables: dict[str, Any] = {} if table is None else {"place": table}
+    loops = equal_blocks.share(listings, dtype) if links.graph.apart else None
+    if loops is not None and loops.kept:
+        *before, body = loops.texts
+        tables |= {equal_blocks.NUMBERS: loops.numbers or [0.0], equal_blocks.ENTRIES: loops.entries}
+    else:
+        *before, body = (render(each, dtype) for each in listings)
     tables |= builder.height_tables(emitter.counts["lookup"] > 0)
     if phases.prologue:
         entries = {GAIN: run.scene.dof_count, SECANT: max(1, sum(item.array == SECANT for item in phases.prologue))}
@@ -61,6 +69,8 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
     elif looped:
         ahead, a_pass = before
         body = pass_loops.repeat_passes(ahead, a_pass, body, LOOPED, run.scene.dof_count, run.dtype)
+    if loops is not None and loops.kept:
+        body = f"{C_TYPE[dtype]} {equal_blocks.KEPT}[{loops.kept}];\n{body}"
     direct = layout.staged and plan.copies_directly(routine)
     late = direct and routine.hints.waits_late
     block = PAIR * WARP_SIZE if late or (plan.latency_bound and not layout.shared_scalars) else WARP_SIZE

@@ -24,6 +24,7 @@ Factors = dict[int, Any]
 """The factor of every link by id, of :mod:`.articulated`; at the leader of a group the factor of
 :mod:`.shared_dofs`."""
 NO_FORCE = Vector((*ZERO, *ZERO))
+MANY = 8  # children of a link whose contributions are worth a loop
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +77,7 @@ def eliminate(
     carried = trace.exchange.from_children(link, "P", inner, Articulated.unpacked)
     if id(link) in terms.inertia:
         carried = [*carried, terms.inertia[id(link)]]
+    carried = _add_one_by_one(trace, link, carried, "P")
     if link.shared_dofs is not None:
         P = total_inertia(link, carried)
         done[id(link)] = articulated.LinkFactor([], P, NO_INERTIA, False, False, 0.0)
@@ -90,6 +92,18 @@ def eliminate(
     place = trace.places[id(link)]
     done[id(link)] = found = factor(terms.with_armature(link), place, carried, through, trace.epsilon)
     inner[id(link)] = found.in_parent
+
+
+def _add_one_by_one(trace: Trace, link: Link, terms: list, letter: str) -> list:
+    """Return the sum of what many children send, each added in a step of its own, where equal steps share a text."""
+    if not trace.graph.apart or len(terms) < MANY:
+        return terms
+    found = terms[0]
+    for child, term in enumerate(terms[1:], 1):
+        trace.graph.step = f"{link.title}, {child}|{letter}"
+        found = found + term
+    trace.label(link, letter)
+    return [found]
 
 
 def total_inertia(link: Link, carried: list[Articulated]) -> Articulated:
@@ -146,7 +160,7 @@ def reduce(
             phases.add_invariants([*(place.pose.turn or ()), *bias, *z])
         if key in terms.force:
             z = z - terms.force[key]
-        for force in trace.exchange.from_children(link, letters[-1], forces, Vector):
+        for force in _add_one_by_one(trace, link, trace.exchange.from_children(link, letters[-1], forces, Vector), "z"):
             z = z + force
         if link.shared_dofs is None:
             right = [tau(dof) for dof in link.dofs]

@@ -309,7 +309,7 @@ class Emitter:
             return [f"const {T} {self._name(scalar, step)} = {self._load(args[0], self._entry(args[0], args[1:]))};"]
         if op in ("sin", "cos"):
             angle = self._text(args[0])
-            sine, cosine = (self._name(scalar.graph.make(name, *args), name) for name in ("sin", "cos"))
+            sine, cosine = (self._name(scalar.graph.beside(scalar, name), name) for name in ("sin", "cos"))
             which = "sincos" if args[0].op == "input" else "sincos_any"  # coordinates are within reach already
             return [f"{T} {sine}, {cosine};", f"on::{which}({angle}, {sine}, {cosine});"]
         if scalar.key in self._chains:

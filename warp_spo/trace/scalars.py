@@ -30,11 +30,13 @@ class Graph:
 
     Attributes:
         step: the name of the current step, "link|letter"; new scalars are named after it.
+        apart: equal operations of different links are different scalars, so that links that are alike compute alike.
+            What reads an array stays one scalar, because a later statement may write there.
     """
 
     def __init__(self) -> None:
         self._known: dict[tuple, Scalar] = {}
-        self.step = "v"
+        self.step, self.apart = "v", False
 
     @property
     def empty(self) -> bool:
@@ -48,10 +50,19 @@ class Graph:
     def make(self, op: str, *args: Any) -> Scalar:
         """Return the scalar of an operation, without simplification; equal operations give the same scalar."""
         key = (op, *args)  # scalars are equal if they are one
+        if self.apart and op not in ("input", "number"):
+            key = (self.step.rpartition("|")[0], *key)
         known = self._known.get(key)
         if known is None:
             known = self._known[key] = Scalar(self, op, args, len(self._known))
         return known
+
+    def beside(self, scalar: Scalar, op: str) -> Scalar:
+        """Return the scalar of an operation with the arguments of ``scalar``, in the step of that."""
+        step, self.step = self.step, scalar.step
+        found = self.make(op, *scalar.args)
+        self.step = step
+        return found
 
 
 class Scalar:
