@@ -184,9 +184,8 @@ def test_motors_along_a_curve_obey(device):
 def test_a_servo_without_strength_leaves_the_bound_to_the_motor(variable, device):
     """As one of a disabled group of MuJoCo; before, the bound was the servo's and went with it: 100 N pushed."""
     servo = spo.Actuator(0, **SERVO, force_range=(-5.0, 5.0))
-    scene = spo.Scene(
-        [spo.Body(M)], [spo.Hinge("prismatic", -1, 0)], gravity=(0, 0, 0), actuators=[servo, spo.Actuator(0)]
-    )
+    slide = spo.Hinge("prismatic", -1, 0, axis=(1, 0, 0))
+    scene = spo.Scene([spo.Body(M)], [slide], gravity=(0, 0, 0), actuators=[servo, spo.Actuator(0)])
     for strength in (1.0, 1e-9, 0.0):
         weak = set_limit(scene, 2.0).with_values(actuator_strength=[strength, 1.0])
         dyn = spo.Dynamics(weak, 1, device=device, dtype="float64", variable=variable)
