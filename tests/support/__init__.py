@@ -21,7 +21,8 @@ Newton's models and SolverSPO:
     ``newton_models``, ``solver_models``, ``solver_grounds``, ``solver_pair_models``.
 Files:
     ``random_mjcf``, ``mjcf_texts``, ``mjcf_damage``, ``damage`` (of URDF), ``fuzz_faults`` (a loader that fails),
-    ``usd_texts``, ``random_usd`` (attributes at random beside OpenUSD).
+    ``usd_texts``. Attributes at random: ``mjcf_attributes`` and ``mjcf_misreadings`` (beside MuJoCo),
+    ``urdf_attributes`` (beside Pinocchio), ``random_usd`` (beside OpenUSD).
 Truths and laws:
     ``laws`` (of every operation), ``oracles`` (Pinocchio, MuJoCo), ``reference_cases``, ``closed_loops`` (Lagrange's
     equations), ``gradients`` (the operations that torch differentiates).
