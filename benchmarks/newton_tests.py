@@ -1,6 +1,6 @@
 """Newton's own solver tests with SolverSPO in their solver's place, their assertions untouched.
 
-    python -m benchmarks.newton_tests --json benchmarks/results/NEWTON_TESTS.json     # all, on a CPU
+    python -m benchmarks.newton_tests --json benchmarks/results/files/NEWTON_TESTS.json     # all, on a CPU
     python -m benchmarks.newton_tests test_joint_drive --match free                     # some
 
 ``newton.solvers.SolverFeatherstone``, ``SolverMuJoCo``, ``SolverSemiImplicit`` and ``SolverXPBD`` become SolverSPO
@@ -36,7 +36,7 @@ from typing import Any
 
 import warp as wp
 
-RESULTS = Path(__file__).parent / "results" / "2026-11-28-cpu-newton-tests.json"
+RESULTS = Path(__file__).parent / "results" / "files" / "2026-11-28-cpu-newton-tests.json"
 SOLVERS = ("SolverFeatherstone", "SolverMuJoCo", "SolverSemiImplicit", "SolverXPBD")
 SUFFIX = re.compile(r"_(featherstone|mujoco(_cpu|_warp|_c)?|semi_implicit|xpbd)(?=_|$)")
 OTHERS = re.compile(r"_(steel|kamino|lox|vbd|admm|mpm|steel_colored)(_|$)")

@@ -4,7 +4,7 @@ import functools
 
 import warp as wp
 
-from .status import NOT_FINITE, PIVOT, QUATERNION, RANGE
+from .status import NORMAL, NOT_FINITE, PIVOT, QUATERNION, RANGE
 
 LOOPS = 6  # as warp_spo.Status, which kernels cannot import; a test compares
 ANGLE, ROTATION = 1, 2  # kinds of coordinates: an angle, and the first of four that are a quaternion
@@ -21,7 +21,7 @@ def check_results(T: type) -> wp.Kernel:
     that a call has written, [world, ...], or None. A gap may be infinite. ``kinds`` [coordinate] is ANGLE, ROTATION
     or 0.
     """
-    least, most = (T(x) for x in SQUARES[T])
+    tiny, least, most = T(NORMAL[T][0]), *(T(x) for x in SQUARES[T])
 
     @wp.func
     def finite_row(array: wp.array2d[T], world: int):
@@ -41,17 +41,20 @@ def check_results(T: type) -> wp.Kernel:
         return fine
 
     @wp.func
-    def within_reach(q: wp.array2d[T], kinds: wp.array[wp.int32], world: int):
-        fine = bool(True)
+    def word_of(q: wp.array2d[T], kinds: wp.array[wp.int32], world: int):
+        found = int(0)
         for i in range(kinds.shape[0]):
-            if kinds[i] == wp.static(ANGLE):
-                fine = fine and wp.abs(q[world, i]) <= T(wp.static(FARTHEST))
+            if kinds[i] == wp.static(ANGLE) and wp.abs(q[world, i]) > T(wp.static(FARTHEST)):
+                found = wp.max(found, RANGE)
             if kinds[i] == wp.static(ROTATION):
                 square = T(0.0)
                 for c in range(4):
                     square += q[world, i + c] * q[world, i + c]
-                fine = fine and square >= least and square <= most
-        return fine
+                if square < tiny:
+                    found = QUATERNION
+                elif square < least or square > most:
+                    found = wp.max(found, RANGE)
+        return found
 
     @wp.kernel(module=f"warp_spo_result_check_{T.__name__}", enable_backward=False)
     def kernel(
@@ -71,12 +74,10 @@ def check_results(T: type) -> wp.Kernel:
         status_out: wp.array[wp.int32],
     ):
         world = wp.tid()
-        known = status_out[world]
-        if known == NOT_FINITE or known == QUATERNION:
-            return
-        if not within_reach(q, kinds, world):
-            status_out[world] = RANGE
-        elif known != PIVOT and known != RANGE and known != wp.static(LOOPS):
+        known, asked = status_out[world], word_of(q, kinds, world)
+        if asked == QUATERNION or (asked == RANGE and known != NOT_FINITE):
+            status_out[world] = asked
+        elif known != NOT_FINITE and known != PIVOT and known != RANGE and known != wp.static(LOOPS):
             fine = finite_row(q_after, world) and finite_row(rates, world) and finite_row(qdd, world)
             fine = fine and finite_row(slip, world) and finite_row(excess, world)
             fine = fine and finite_rows(force, world)

@@ -17,7 +17,7 @@ from typing import Any
 import warp as wp
 
 from .elementary import EPSILON
-from .kinematics import BALL, FREE, SCREWS
+from .kinematics import SCREWS
 from .topology import Topology
 
 OK, PIVOT, NOT_FINITE, DIGITS, RANGE, NOT_SETTLED = range(6)
@@ -302,27 +302,6 @@ def status_word(s) -> wp.Kernel:
         elif not resolved or cancelled > most_cancelled * largest:
             word = int(DIGITS)
         status_out[world] = word
-
-    return kernel
-
-
-@functools.cache
-def mark_quaternions(T) -> wp.Kernel:
-    """Set QUATERNION in worlds where the square of a quaternion in q is no normal number; NaN is another word's."""
-    tiny = T(NORMAL[T][0])
-
-    @wp.kernel(module=f"warp_spo_quaternions_{T.__name__}", enable_backward=False)
-    def kernel(topology: Topology, q: wp.array2d[T], status_out: wp.array[wp.int32]):
-        world = wp.tid()
-        for node in range(topology.motion.shape[0]):
-            first = topology.q_start[node]
-            if topology.motion[node] == FREE:
-                first += 3
-            elif topology.motion[node] != BALL:
-                continue
-            x, y, z, w = q[world, first], q[world, first + 1], q[world, first + 2], q[world, first + 3]
-            if (x * x + y * y) + (z * z + w * w) < tiny:
-                status_out[world] = QUATERNION
 
     return kernel
 

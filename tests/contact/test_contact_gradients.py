@@ -100,7 +100,7 @@ def test_any_number_of_passes_is_differentiated(passes):
 
 
 BUGS = {
-    "earlier passes frozen": (PassAdjoint, "_results", "self._of_later(COTANGENT, self._dofs + item.index[0])", "0.0"),
+    "earlier passes frozen": (PassAdjoint, "_results", "self._of_later(COTANGENT, self._dofs + x.index[0])", "0.0"),
     "what passes begin with": (PassGradient, "stores", "select(pass_variables.first, gradient, 0.0)", "0.0"),
     "a load held": (PassGradient, "stores", "seeds += [1.0,", "seeds += [0.0,"),
     "a load held before": (PassSolve, "stores", "[*seeds, 1.0]", "[*seeds, 0.0]"),

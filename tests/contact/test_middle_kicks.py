@@ -75,7 +75,7 @@ def test_rates_are_of_second_order():
 
 BUGS = {
     "rounds that forget": (velocity_kicks, "_kick", "0.5 * (qd(dof) + previous_rates(dof))", "previous_rates(dof)"),
-    "one kick": (step.ContactStepTrace, "_after", "rates[dof] + self.kick(dof)", "rates[dof]"),
+    "one kick": (step.ContactStepTrace, "_after", "x + self.kick(dof)", "x"),
     "velocity terms at the start": (velocity_kicks, "_kick", '"q": there.__getitem__, ', ""),
 }
 

@@ -19,7 +19,10 @@ PAGES = {page.relative_to(ROOT).as_posix().removeprefix("docs/").replace("/", ".
 CODE = [name for name, page in PAGES.items() if any(block.kind == "python" for block in blocks(page.read_text()))]
 ENTRY = re.compile(r"^\.\. auto(class|method|attribute|function|module):: ([\w.]+)$", re.MULTILINE)
 COMMAND = re.compile(r"python -m ((?:warp_spo|benchmarks)[\w.]*)([^\n`#&]*)")
-OPTIONS = {"warp_spo.examples": (ROOT / "warp_spo" / "examples" / "options.py").read_text()}  # that commands share
+OPTIONS = {  # that commands share
+    "warp_spo.examples": (ROOT / "warp_spo" / "examples" / "options.py").read_text(),
+    "benchmarks": (ROOT / "benchmarks" / "command_line.py").read_text(),
+}
 PUBLIC = {
     "warp_spo.newton": ("SolverSPO", "shipped"),
     "warp_spo.mujoco": ("Coordinates",),

@@ -244,6 +244,7 @@ class Dynamics:
         self.granularity = self.plan.granularity
         self.recursions = Sweeps(scene, self.plan, self.device, self.dtype, self.variable)
         self.programs = Programs(self.recursions, self.plan)
+        self._coordinate_kinds: wp.array = wp.array(kinds_of_coordinates(scene), dtype=wp.int32, device=self.device)
         self.values, self._handle = TensorValues(), register(self)
         self._replays = Replays(self.device, self.recursions.call_order)
         self._engine, self._gradients = Engine(self), Gradients(self)
@@ -333,11 +334,6 @@ class Dynamics:
     def _later_status(self) -> wp.array:
         """Array into which a step writes the status of all substeps but the first [world]."""
         return wp.empty(self.worlds, dtype=wp.int32, device=self.device)
-
-    @functools.cached_property
-    def _coordinate_kinds(self) -> wp.array:
-        """What each coordinate is to the last check of a status [coordinate]."""
-        return wp.array(kinds_of_coordinates(self.scene), dtype=wp.int32, device=self.device)
 
     @functools.cached_property
     def _mask(self) -> wp.array:

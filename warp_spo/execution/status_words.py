@@ -52,7 +52,6 @@ def write(
         launches.launch(kernel, (count, run.worlds), arguments, [rounding, lost], device=run.device)
     values = [p.tree, p.com, p.rigid, armature, p.gravity]
     run.launch_nodes(kernels.status_word, run.worlds, [q, qd, tau, body_f, *values, factors[2], lost, qdd], [status])
-    _mark_quaternions(run, q, status)
 
 
 def write_of_rank(
@@ -67,13 +66,6 @@ def write_of_rank(
     p = run.parameters
     values = [p.tree, p.com, p.rigid, p.field("joint_armature"), p.gravity]
     run.launch(loops.status_word, run.worlds, [q, qd, tau, body_f, *values, qdd, margin, run.dtype(least)], [status])
-    _mark_quaternions(run, q, status)
-
-
-def _mark_quaternions(run: Sweeps, q: wp.array, status: wp.array) -> None:
-    """Set QUATERNION in worlds with a quaternion of zeros, by one launch more where hinges have quaternions."""
-    if any(element.kind.quaternion is not None for hinge in run.scene.hinges for element in hinge.elements):
-        run.launch(kernels.mark_quaternions, run.worlds, [run.topology, q], [status])
 
 
 def check_results(

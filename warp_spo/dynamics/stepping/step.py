@@ -341,9 +341,9 @@ def _launch(
 
 def _apart(dyn: Dynamics, interval: StepArrays) -> wp.array:
     """Return q before the step in an array that the step does not write over."""
+    q = dyn.recursions.array("q before a step", *interval.q.shape)  # made by ``prepare``, too
     if interval.q.ptr != interval.q_out.ptr:
         return interval.q
-    q = dyn.recursions.array("q before a step", *interval.q.shape)
     launches.copy(q, interval.q)
     return q
 

@@ -319,11 +319,12 @@ def _fixed_sizes(scene: Scene) -> list[FixedSizes]:
     """Return the fixed sizes of each loop joint; a size is rounding if it is in several configurations."""
     links, rng = Links(one_world(scene)), np.random.default_rng(0)
     joints, sums = [Closure(links, loop) for loop in scene.loops], []
+    places = {id(link): place_link(link, lambda c: links.graph.input("q", c)) for link in links.links}
+    values = [x for joint in joints for x in (*joint.sums_of_squares(places), joint.distances(places))]
     for _ in range(3):
-        q = (scene.neutral_q + rng.uniform(-1.0, 1.0, len(scene.neutral_q))).tolist()
-        places = {id(link): place_link(link, q.__getitem__) for link in links.links}
-        values = [x for joint in joints for x in (*joint.sums_of_squares(places), joint.distances(places))]
-        sums.append(np.array(evaluate(values, lambda *_: 0.0), dtype=float).reshape(-1, 3))
+        q = scene.neutral_q + rng.uniform(-1.0, 1.0, len(scene.neutral_q))
+        found = evaluate(values, lambda _, index, q=q: q[index[0]])  # type: ignore[misc]
+        sums.append(np.array(found, dtype=float).reshape(-1, 3))
     sliding, turning, distances = np.max(sums, axis=0).T if joints else np.zeros((3, 0))
     return [
         (float(far) if slide <= VANISHES * far else None, 1.0 if turn <= VANISHES else None)

@@ -39,8 +39,6 @@ FORCE, RESISTANCE = "force", "resistance"
 MOST_JOINT_SPACE_DOFS = 10  # dofs; up to so many, passes solve a system that is formed once
 FREE_PASSES, UPDATE_PERIOD = 8, 3
 """After so many passes a dof changes its guess in every third pass only, one dof after the other."""
-COARSE, SMALLEST = 1e-10, (2.0**-1022, 2.0**-126)
-"""Epsilon that parts float64 from float32, and their smallest normal numbers."""
 MASSLESS_RESISTANCE = 1e-12  # share of its laws' resistances that a massless dof without active law gets
 
 
@@ -255,19 +253,7 @@ class Step:
         word = select(self._constraint_error(), Status.OPEN, select(settled, 0.0, Status.NOT_SETTLED))
         word = select(all_finite(results), word, Status.PIVOT)
         known = self._inputs() + self.trace.links.lost_values()
-        word = select(all_finite(known), select(self._rank_loss(), Status.LOOPS, word), Status.NOT_FINITE)
-        return select(self._zero_quaternions(), Status.QUATERNION, word)
-
-    def _zero_quaternions(self) -> Value:
-        """Return non-zero where the square of a quaternion of these links, before the step, is no normal number."""
-        least = SMALLEST[self.trace.epsilon > COARSE]
-        found: Value = 0.0
-        for link in self.links:
-            if link.hinge.quaternion is not None:
-                first = link.coordinate + link.hinge.quaternion
-                x, y, z, w = (self.q(first + i) for i in range(4))
-                found = found + less((x * x + y * y) + (z * z + w * w), least)
-        return found
+        return select(all_finite(known), select(self._rank_loss(), Status.LOOPS, word), Status.NOT_FINITE)
 
     def _send_status(self, results: list[Value]) -> tuple[list[Store], list[Store]]:
         """Return the stores that send a segment's status to the first segment, and for that the store of the worst
@@ -275,7 +261,6 @@ class Step:
         trace, exchange = self.trace, self.trace.exchange
         trace.graph.step = "status|s"
         finite = select(all_finite(self._inputs()), select(all_finite(results), 0.0, Status.PIVOT), Status.NOT_FINITE)
-        finite = select(self._zero_quaternions(), Status.QUATERNION, finite)
         worst_word = []
         if exchange.is_first:
             worst: Value = 0.0
@@ -285,8 +270,6 @@ class Step:
             word = self._final_status(worst)
             values = trace.links.lost_values()  # here, because texts of segments of equal structure are equal
             word = select(all_finite(values), word, Status.NOT_FINITE) if values else word
-            if any(link.hinge.quaternion is not None for link in trace.links.links):
-                word = select(less(worst, Status.QUATERNION - 0.5), word, worst)
             worst_word.append(Store("status", (), word))
         return exchange.send("S", exchange.own_segments[0], [finite]), worst_word
 
