@@ -1,6 +1,8 @@
 import os
+import socket
 import sys
 from pathlib import Path
+from unittest import mock
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # many small matrices: threads only wait for each other
 
@@ -71,3 +73,10 @@ def device(request):
 @pytest.fixture
 def rng():
     return np.random.default_rng(0)
+
+
+@pytest.fixture
+def offline():
+    """A connection is an error: no robot file makes one."""
+    with mock.patch.object(socket.socket, "connect", side_effect=AssertionError("a robot file opened a connection")):
+        yield
