@@ -64,7 +64,9 @@ def free_descendants(scene: Scene, variable: tuple[str, ...] = ()) -> set[int]:
             yield body
             body = inner[body].parent
 
-    touched = {body for contact in scene.contacts for one in (contact, contact.other) if one for body in path(one.body)}
+    points = [point.body for point in scene.contact_points]
+    pairs = [body for pair in scene.contact_pairs for body in (pair.body, pair.other)]
+    touched = {body for one in (*points, *pairs) for body in path(one)}
     found = set()
     for hinge, first in zip(scene.hinges, scene.qd_start, strict=False):
         dofs = slice(first, first + hinge.dof_count)
