@@ -30,12 +30,13 @@ def carried(parent, contacts=()):
     return scene, q, qd
 
 
+@pytest.mark.parametrize("variable", [(), ("joint_damping",)], ids=["constant", "variable"])
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize(("parent", "contacts"), [("revolute", ()), ("free", ()), ("ball", ()), ("free", (FAR,))])
-def test_a_body_at_rest_stays_at_rest(parent, contacts, dtype, device):
+def test_a_body_at_rest_stays_at_rest(parent, contacts, dtype, variable, device):
     """Whatever its parent does, to rounding; before, its speed was up to 4e-3 of the parent's after a step of 10 ms."""
     scene, q, qd = carried(parent, contacts)
-    dyn = spo.Dynamics(scene, 1, device=device, dtype=dtype)
+    dyn = spo.Dynamics(scene, 1, device=device, dtype=dtype, variable=variable)
     after, rates = dyn.step(q[None], qd[None], None, DT)
     dense = Dense(scene, np.float64(after[0]))
     parent_speed = np.abs(dense.jacobian([0])[0] @ np.float64(rates[0])).max()
@@ -93,8 +94,9 @@ def test_gradients_know_how_it_is_carried(device):
         assert laws.error((given[name].grad.numpy() * along).sum(), slope[0]) <= 1e-8
 
 
+@pytest.mark.parametrize("variable", [(), ("joint_stiffness", "joint_damping")], ids=["constant", "variable"])
 @pytest.mark.parametrize("law", [dict(stiffness=1e6, damping=1e3), dict(target_ke=1e6, target_kd=1e3)])
-def test_stiff_laws_of_its_hinge_hold_it(law, device):
+def test_stiff_laws_of_its_hinge_hold_it(law, variable, device):
     """On a fast turntable, w h = 0.3, a spring's deflection is that of the centrifugal force, m r w^2 / k."""
     mass, radius, speed = 1.0, 0.5, 30.0
     bodies = [spo.Body(mass, inertia=0.01 * np.eye(3)) for _ in range(2)]
@@ -103,7 +105,11 @@ def test_stiff_laws_of_its_hinge_hold_it(law, device):
         spo.Hinge("free", 0, 1, parent_pose=(radius, 0, 0, 0, 0, 0, 1), **law),
     ]
     scene = spo.Scene(bodies, hinges, gravity=(0, 0, 0))
-    dyn = spo.Dynamics(scene, 1, device=device, dtype="float64")
+    given = {name: scene.values[name] for name in variable}
+    bare = scene.with_values(**{name: np.zeros(scene.dof_count) for name in variable})  # laws that come later
+    dyn = spo.Dynamics(bare, 1, device=device, dtype="float64", variable=variable)
+    if variable:
+        dyn.set(**given)
     q, qd = scene.neutral_q[None], np.eye(1, scene.dof_count) * speed
     for _ in range(100):
         q, qd = dyn.step(q, qd, None, DT)

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ...hinges.quaternions import Quaternion, multiply, quaternion_rotation, rotate_by
 from ...scene.scene import Scene
-from ...trace.scalars import Value
-from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross
+from ...trace.scalars import Value, absolute, is_constant, select
+from ...trace.spatial import IDENTITY, ZERO, Matrix, Vector, cross, total
 from ..coordinates import integrate_link
 from ..kinematics import NEUTRAL, relative_quaternion
 from ..model.links import Link, place_link
@@ -51,12 +51,8 @@ class InertialLink(NamedTuple):
 GROUND = InertialLink(IDENTITY, NEUTRAL, ZERO, ZERO, ZERO)
 
 
-def free_descendants(scene: Scene, variable: tuple[str, ...] = ()) -> set[int]:
-    """Return the first dofs of the free hinges on bodies that move, on which neither laws nor contacts act.
-
-    Args:
-        variable: names of values that may differ from the scene's.
-    """
+def free_descendants(scene: Scene) -> set[int]:
+    """Return the first dofs of the free hinges on bodies that move, on which neither laws nor contacts act."""
     inner = {hinge.child: hinge for hinge in scene.hinges}
 
     def path(body: int) -> Iterator[int]:
@@ -72,7 +68,7 @@ def free_descendants(scene: Scene, variable: tuple[str, ...] = ()) -> set[int]:
         dofs = slice(first, first + hinge.dof_count)
         moves = hinge.unconstrained and any(inner[body].dof_count for body in path(hinge.parent))
         if moves and hinge.child not in touched:
-            has_laws = any(name in variable or scene.values[name][:, dofs].any() for name in LAWS)
+            has_laws = any(scene.values[name][:, dofs].any() for name in LAWS)
             has_laws |= bool((scene.values["joint_velocity_limit"][:, dofs] < DEFAULT_BOUND).any())
             found |= set() if has_laws else {int(first)}
     return found
@@ -93,17 +89,29 @@ def states_after(
         carries: free bodies on links that move are carried, as said above; otherwise their rates are those given.
     """
     q_after, qd_after = Entries(), dict(rates)
-    free = free_descendants(trace.links.scene, trace.links.variable) if carries else set()
+    free = free_descendants(trace.links.scene) if carries else set()
     carried = {id(link) for link in links if free.intersection(link.dofs)}
     gains = {dof: rate - qd(dof) for dof, rate in rates.items()} if carried else {}
     for link in links:
         trace.label(link, "q")
         if id(link) in carried:
             coordinates = _carry(link, q, qd, gains, q_after, qd_after, h)
+            held = total(absolute(law) for law in _variable_laws(trace, link))
+            if not is_constant(held):  # the values of a world may have laws where the scene's have none
+                plain = integrate_link(link, q, rates.__getitem__, h)
+                coordinates = [select(held, x, y) for x, y in zip(plain, coordinates, strict=True)]
+                qd_after |= {dof: select(held, rates[dof], qd_after[dof]) for dof in link.dofs}
         else:
             coordinates = integrate_link(link, q, rates.__getitem__, h)
         q_after |= {link.coordinate + c: value for c, value in enumerate(coordinates)}
         yield link, coordinates, [qd_after[dof] for dof in link.dofs]
+
+
+def _variable_laws(trace: Trace, link: Link) -> Iterator[Value]:
+    """Yield those values of the laws of a link's hinge that may differ from the scene's."""
+    for name in LAWS:
+        if name in trace.links.variable:
+            yield from (trace.graph.input(name, dof) for dof in link.dofs)
 
 
 def _carry(
