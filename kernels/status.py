@@ -255,10 +255,10 @@ def status_word(s) -> wp.Kernel:
     left the normal range, the result overflows, or every entry of it is subnormal. DIGITS: D may have lost half of the
     digits of T, lost > 2 eps^-1/2; measured errors are 0.02 to 0.8 of ``lost``. Or forces of the dofs nearly cancel
     the others: the error of qdd is up to 5 eps |Mass^-1| |tau|, whose largest entry is 2 to 8 times that of |tau| / D.
+    ``most_cancelled``: the largest |tau| / D over qdd of which half of the digits are left.
     """
     T = s.T
     most = T(2.0 * EPSILON[T] ** -0.5)
-    most_cancelled = T(0.25 * EPSILON[T] ** -0.5)
     none = T(0.1 / EPSILON[T])
     tiny = T(NORMAL[T][0])
 
@@ -274,6 +274,7 @@ def status_word(s) -> wp.Kernel:
         armature: wp.array2d[T],
         gravity: wp.array2d[T],
         pivot: wp.array2d[T],
+        most_cancelled: T,
         lost: wp.array2d[T],
         qdd: wp.array2d[T],
         status_out: wp.array[wp.int32],

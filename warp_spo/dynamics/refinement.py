@@ -50,7 +50,7 @@ class Refinement:
         swept = narrow._engine.launch(FORWARD_DYNAMICS, x, tau=right, **low)
         if status is not None:
             found = low["q"], low["qd"], right, low["body_f"], x, status
-            status_words.write(narrow.recursions, *found, factored=swept)
+            status_words.write(narrow.recursions, *found, factored=swept, refined=self.steps)
         self._refine(low["q"], x, tau, out, **high)
 
     def solve_mass_matrix(self, q: wp.array, b: wp.array, out: wp.array) -> None:

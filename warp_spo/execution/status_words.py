@@ -10,6 +10,7 @@ import warp as wp
 from ..hinges.elementary import PRISMATIC
 from ..kernels import declare, loops, result_check
 from ..kernels import status as kernels
+from ..kernels.elementary import EPSILON
 from ..kernels.spatial import ARTICULATED
 from ..runtime import launches
 from ..scene.scene import Scene
@@ -25,13 +26,15 @@ def write(
     qdd: wp.array,
     status: wp.array,
     factored: bool,
+    refined: int = 0,
 ) -> None:
     """Write ``status`` [world] after forward dynamics, by one inward sweep and one launch over the worlds.
 
     The sweep reads pose, axis, articulated, gain and pivot. With ``factored``, forward dynamics has left them in the
     workspace. Otherwise a generated kernel computed forward dynamics, and the sweeps factorise now. The digits that
     they lose are an upper bound for the generated kernel, whose hinges lie along axes. Where links share dofs, digits
-    are not estimated: a world is NOT_FINITE, PIVOT or OK.
+    are not estimated: a world is NOT_FINITE, PIVOT or OK. Each of the steps by which qdd is ``refined`` later
+    multiplies the error of torques that nearly cancel the other loads by itself.
     """
     if run.scene.shares_dofs:
         write_of_rank(run, q, qd, tau, body_f, qdd, run.array("no margin", run.worlds, 0), 0.0, status)
@@ -51,7 +54,10 @@ def write(
         arguments = [run.topology, first, *inputs]
         launches.launch(kernel, (count, run.worlds), arguments, [rounding, lost], device=run.device)
     values = [p.tree, p.com, p.rigid, armature, p.gravity]
-    run.launch_nodes(kernels.status_word, run.worlds, [q, qd, tau, body_f, *values, factors[2], lost, qdd], [status])
+    epsilon = EPSILON[run.dtype]  # type: ignore[index]
+    allowed = run.dtype(0.25 * epsilon ** (0.5 / (refined + 1) - 1.0))
+    loads: list[Any] = [q, qd, tau, body_f]
+    run.launch_nodes(kernels.status_word, run.worlds, [*loads, *values, factors[2], allowed, lost, qdd], [status])
 
 
 def write_of_rank(
