@@ -45,8 +45,8 @@ class Status(enum.IntEnum):
     UNSUPPORTED = 10
     """Some contacts are of a kind that the solver cannot take; they were left out."""
     QUATERNION = 11
-    """A quaternion among the coordinates is zero, or its square is below the normal numbers of the dtype: it is no
-    rotation."""
+    """A quaternion among the coordinates is no rotation, because it is zero, or its square is below the normal numbers
+    of the dtype."""
 
     @property
     def advice(self) -> str:

@@ -136,7 +136,7 @@ def forward_dynamics(
             * 3, DIGITS: by an estimate from above, D keeps fewer than half of the dtype's digits, perhaps none. The
               result stands. Use float64 for such worlds, give light links armature, and lay hinge axes along the axes
               of the anchors. Also where tau nearly cancels gravity and velocity terms, so that digits are lost as in
-              any subtraction: the error is about eps |Mass^-1| |tau|. Pass gravity through the scene and wrenches
+              any subtraction: the error is about eps ``|Mass^-1| |tau|``. Pass gravity through the scene and wrenches
               through body_f, not through tau.
             * 6, LOOPS: the closures of the loops lose rank here, or half of the dtype's digits, at a change point. The
               result is NaN where rank is lost, and stands otherwise. Use float64, or stay away from the change point.

@@ -238,7 +238,7 @@ class Identity(Operator):
         size: number of rows and columns.
         device: the CPU unless given.
         dtype: "float32" or "float64".
-        worlds: number of worlds of :meth:`dense`; 1 goes with operators of any number.
+        worlds: number of worlds of ``dense``; 1 goes with operators of any number.
     """
 
     def __init__(self, size: int, device="cpu", dtype="float64", kind: str | None = None, worlds: int = 1):
