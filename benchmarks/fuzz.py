@@ -104,7 +104,7 @@ def damaged(texts: list[bytes], seed: int) -> tuple[bytes, dict[str, Any]]:
     return text, {name: values[rng.integers(len(values))] for name, values in options.items()}
 
 
-def _found(pattern: re.Pattern[bytes], text: bytes, rng: np.random.Generator) -> tuple[int, int]:
+def _find_place(pattern: re.Pattern[bytes], text: bytes, rng: np.random.Generator) -> tuple[int, int]:
     """Return where one of the matches of a pattern is, or a random place without any."""
     start = int(rng.integers(len(text) + 1))
     match = pattern.search(text, start) or pattern.search(text)
@@ -115,7 +115,7 @@ def _put(
     pattern: re.Pattern[bytes], choices: tuple[bytes, ...] | list[bytes], quotes: bytes = b""
 ) -> Callable[..., bytes]:
     def put(text: bytes, other: bytes, rng: np.random.Generator) -> bytes:
-        start, stop = _found(pattern, text, rng)
+        start, stop = _find_place(pattern, text, rng)
         return text[:start] + quotes + choices[rng.integers(len(choices))] + quotes + text[stop:]
 
     return put
@@ -126,8 +126,8 @@ def _from(pattern: re.Pattern[bytes], whose: str) -> Callable[..., bytes]:
 
     def put(text: bytes, other: bytes, rng: np.random.Generator) -> bytes:
         source = text if whose == "own" else other
-        first, last = _found(pattern, source, rng)
-        start, stop = _found(pattern, text, rng)
+        first, last = _find_place(pattern, source, rng)
+        start, stop = _find_place(pattern, text, rng)
         return text[:start] + source[first:last] + text[start if pattern is ELEMENT and rng.random() < 0.5 else stop :]
 
     return put
@@ -135,7 +135,7 @@ def _from(pattern: re.Pattern[bytes], whose: str) -> Callable[..., bytes]:
 
 def _cut(pattern: re.Pattern[bytes]) -> Callable[..., bytes]:
     def cut(text: bytes, other: bytes, rng: np.random.Generator) -> bytes:
-        start, stop = _found(pattern, text, rng)
+        start, stop = _find_place(pattern, text, rng)
         return text[:start] + text[stop:]
 
     return cut
@@ -158,7 +158,7 @@ def _flip(text: bytes, other: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _repeat(text: bytes, other: bytes, rng: np.random.Generator) -> bytes:
-    start, stop = _found(ELEMENT, text, rng)
+    start, stop = _find_place(ELEMENT, text, rng)
     return text[:start] + text[start:stop] * int(rng.integers(2, 20)) + text[stop:]
 
 

@@ -4,7 +4,7 @@
     python -m benchmarks.newton_tests test_joint_drive --match free                     # some
 
 ``newton.solvers.SolverFeatherstone``, ``SolverMuJoCo``, ``SolverSemiImplicit`` and ``SolverXPBD`` become SolverSPO
-while a file of tests is read and run, without the options that only they have. What counts is every test that made such
+while a file of tests is read and run, without the options that only they have. Every test counts that made such
 a solver; one that Newton runs with several solvers counts once, in the order of these names. The outcomes:
 
     passed      -

@@ -214,7 +214,7 @@ def test_actions_obey_the_effort_limit(action):
 
 
 def test_a_shared_effort_limit_leaves_no_force_of_each():
-    """What a drive and an actuator give together is bounded in the step, so their forces apart are refused."""
+    """The step bounds the sum of a drive and an actuator, so that the force of each alone is refused."""
     scene = limited_cart().with_values(joint_target_ke=[10.0, 0.0])
     with pytest.raises(ValueError, match=r"World.joint_force: joint 'slide' has a drive and an actuator that share"):
         cart_env(

@@ -71,7 +71,7 @@ def seen(folder, one):
     return False
 
 
-def found(folder, files, seed=0):
+def read_files(folder, files, seed=0):
     wrong, counts = [], collections.Counter()
     for number, (rng, chosen) in enumerate(random_files(seed, files)):
         wrong += [f"{number}: {words}" for words in read(folder, rng, chosen)]
@@ -98,7 +98,7 @@ def test_the_attributes_are_many():
 
 def test_each_attribute_is_right_or_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # where MuJoCo writes its log
-    assert not found(tmp_path, 2)[0]
+    assert not read_files(tmp_path, 2)[0]
 
 
 def test_each_other_attribute_is_refused(tmp_path, monkeypatch):
@@ -109,7 +109,7 @@ def test_each_other_attribute_is_refused(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_each_attribute_is_right_or_named_in_ten_files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    wrong, counts = found(tmp_path, 80, seed=1)
+    wrong, counts = read_files(tmp_path, 80, seed=1)
     assert not wrong and min(counts.values()) >= OFTEN and not refusals(tmp_path, OFTEN, seed=1)
 
 

@@ -12,7 +12,7 @@ pytest.importorskip("newton_usd_schemas")
 pytestmark = pytest.mark.filterwarnings("ignore::newton.NewtonWarning")
 
 
-def found(folder, files, seed=0):
+def read_files(folder, files, seed=0):
     """The misreadings of some random files."""
     wrong = []
     for number, (rng, chosen) in enumerate(random_files(seed, files)):
@@ -27,13 +27,13 @@ def test_the_attributes_are_many():
 
 
 def test_each_attribute_arrives_or_is_named(tmp_path):
-    assert not found(tmp_path, 2)
+    assert not read_files(tmp_path, 2)
 
 
 @pytest.mark.slow
 def test_each_attribute_arrives_or_is_named_in_ten_files(tmp_path):
     """Half of twenty files."""
-    assert not found(tmp_path, 20, seed=1)
+    assert not read_files(tmp_path, 20, seed=1)
 
 
 def without(table, name):
@@ -65,4 +65,4 @@ def test_planted_misreadings_are_found(name, tmp_path):
     from warp_spo.newton.files import usd, usd_stage, usd_values
 
     with PLANTED[name](usd, usd_values, usd_stage):
-        assert found(tmp_path, 2)
+        assert read_files(tmp_path, 2)

@@ -12,7 +12,7 @@ from warp_spo.newton.files import urdf, urdf_shapes
 OFTEN = 10  # files of each attribute
 
 
-def found(folder, files, seed=0):
+def read_files(folder, files, seed=0):
     wrong, counts, file = [], collections.Counter(), folder / "robot.urdf"
     for number, (rng, chosen) in enumerate(random_files(seed, files)):
         drawn = [one.drawn(rng) for one in chosen]
@@ -23,12 +23,12 @@ def found(folder, files, seed=0):
 
 
 def test_each_attribute_is_right_or_named(tmp_path):
-    assert not found(tmp_path, 2)[0]
+    assert not read_files(tmp_path, 2)[0]
 
 
 @pytest.mark.slow
 def test_each_attribute_is_right_or_named_in_ten_files(tmp_path):
-    wrong, counts = found(tmp_path, 2 * OFTEN, seed=1)
+    wrong, counts = read_files(tmp_path, 2 * OFTEN, seed=1)
     assert not wrong and min(counts.values()) >= OFTEN and len(counts) == len(ATTRIBUTES)
 
 
@@ -61,4 +61,4 @@ PLANTED = {
 @pytest.mark.parametrize("name", PLANTED)
 def test_planted_misreadings_are_found(name, tmp_path):
     with PLANTED[name]():
-        assert found(tmp_path, 2)[0]
+        assert read_files(tmp_path, 2)[0]

@@ -47,7 +47,7 @@ def depths(model, solver, heights, contacts):
     return heights - state.body_q.numpy()[:, 2]
 
 
-def made(model, contacts):
+def make_solver(model, contacts):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         solver = SolverSPO(model, variable=("shape_material_ke",), contacts=contacts, pairs=[])  # kernels for all ke
@@ -59,7 +59,7 @@ def test_shapes_that_sink_are_named_with_the_value_that_carries_them(contacts):
     kinds = ("sphere", "cylinder") if contacts == "ground" else ("capsule", "box")
     masses = dict.fromkeys(kinds, 1000.0)
     model, heights = heavy(masses)
-    solver, (message,) = made(model, contacts)
+    solver, (message,) = make_solver(model, contacts)
     assert message.startswith(f"SolverSPO: ke of {len(masses)} shape(s) is too small")
     sunk = depths(model, solver, heights, contacts)
     limits = np.array([0.1 * SIZES[kind] for kind in masses])
@@ -71,7 +71,7 @@ def test_shapes_that_sink_are_named_with_the_value_that_carries_them(contacts):
     assert needed.keys() == masses.keys()
     ground = max(needed.values())
     model.shape_material_ke.assign(np.array([ground, *(2.0 * needed[kind] - ground for kind in masses)]))  # the means
-    solver, messages = made(model, contacts)
+    solver, messages = make_solver(model, contacts)
     rest = depths(model, solver, heights, contacts)
     assert messages == []
     np.testing.assert_array_less(rest, limits)
@@ -81,26 +81,26 @@ def test_shapes_that_sink_are_named_with_the_value_that_carries_them(contacts):
 def test_who_is_not_named():
     """Bodies that ke carries, that a joint carries, that nothing pulls, or that touch nothing; worlds count each."""
     masses = {"sphere": 1.0, "box": 15.0}
-    _, messages = made(heavy(masses)[0], "ground")
+    _, messages = make_solver(heavy(masses)[0], "ground")
     assert messages == []
     builder = newton.ModelBuilder()
     builder.add_ground_plane()
     link = builder.add_link(label="arm")
     builder.add_shape_box(link, hx=0.1, hy=0.1, hz=0.1, cfg=newton.ModelBuilder.ShapeConfig(density=1e6))
     builder.add_articulation([builder.add_joint_revolute(-1, link)])
-    assert made(builder.finalize(device="cpu"), "ground")[1] == []
+    assert make_solver(builder.finalize(device="cpu"), "ground")[1] == []
     masses["box"] = 1000.0
     model, _ = heavy(masses)
-    assert made(model, "none")[1] == []
+    assert make_solver(model, "none")[1] == []
     worlds = newton.ModelBuilder()
     for _ in range(2):
         worlds.add_world(box_builder())
     model = worlds.finalize(device="cpu")
     model.body_mass.assign([1.0, 1000.0])
-    ((message),) = made(model, "ground")[1]
+    ((message),) = make_solver(model, "ground")[1]
     assert "ke of 1 shape(s)" in message and "1e+03 kg" in message
     model.set_gravity((0.0, 0.0, 0.0))
-    assert made(model, "ground")[1] == []
+    assert make_solver(model, "ground")[1] == []
 
 
 def box_builder():

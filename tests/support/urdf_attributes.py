@@ -149,7 +149,7 @@ def misreadings(file, chosen):
             if not np.isclose(scene.values[name][0, dof], value, rtol=1e-14):
                 wrong.append(f"{name} of {joint}: {scene.values[name][0, dof]}, in Pinocchio {value}")
     model = mujoco.MjModel.from_xml_string(
-        re.sub(r"<(collision|inertia) .*?/>|<collision>.*?</collision>", _kept, content)
+        re.sub(r"<(collision|inertia) .*?/>|<collision>.*?</collision>", _simplify, content)
     )
     equality, (coupling,) = model.eq_data[0], scene.couplings
     names = [scene.hinges[hinge].label.split("/")[-1] for hinge in (coupling.hinge, coupling.reference)]
@@ -163,7 +163,7 @@ def misreadings(file, chosen):
     return wrong
 
 
-def _kept(found):
+def _simplify(found):
     """Collision shapes go; a moment of inertia becomes one that MuJoCo takes."""
     whole = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0" />'
     return whole if found[0].startswith("<inertia") else ""

@@ -1,4 +1,4 @@
-"""What an MJCF file expands to, looked at before MuJoCo does it.
+"""Bounds of the elements that an MJCF file expands to, checked before MuJoCo compiles it.
 
 A short file may ask for billions of elements, or attach itself without end; MuJoCo's compiler then runs for hours, or
 ends the process. So it does where the name of a class that is not there holds a format of C's printf (MuJoCo 4.0.0).
