@@ -41,6 +41,12 @@ def shown(name: str, most: int = 64) -> str:
     return text if len(text) <= most else f"{text[: most // 2]}...{text[-most // 4 :]}"
 
 
+def quoted(name: Any, most: int = 64) -> str:
+    """Return ``repr(name)``, such as a name in quotes, with a long middle left out."""
+    text = repr(name)
+    return text if len(text) <= most + 2 else f"{text[: most // 2]}...{text[-most // 4 :]}"
+
+
 def is_bool(value: Any) -> bool:
     """Return whether a value is a bool or an array of bools, of Python, NumPy or torch."""
     return isinstance(value, bool) or str(getattr(value, "dtype", "")).endswith("bool")

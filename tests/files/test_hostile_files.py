@@ -37,6 +37,8 @@ REFUSED = {
     "a joint of a link with itself": robot(link("a"), joint("a", "a")),
     "a number of a megabyte": robot(link("a"), link("b").replace('"1"', f'"{"9" * 1_000_000}"', 1), joint("a", "b")),
     "an infinite mass": robot(link("a"), link("b").replace('value="1"', 'value="inf"'), joint("a", "b")),
+    "a long name of no link": robot(link("a"), joint("x" * 70_000, "a")),
+    "a long word for a type": robot(link("a"), link("b"), joint("a", "b", "x" * 70_000)),
     "a torn file": robot(link("a"), link("b"), joint("a", "b"))[:-25],
     "no file at all": "\0\1\2\3" * 100,
 }  # fmt: skip
@@ -49,6 +51,18 @@ def test_is_refused_by_an_error_that_names_the_file(name, tmp_path):
     with pytest.raises(ValueError, match=r"hostile\.urdf") as error:
         spo.load(file)
     assert len(str(error.value)) < 2000 and "/etc" not in str(error.value)
+
+
+def test_warnings_show_the_ends_of_long_names(tmp_path):
+    """Of joints and of shapes that are left out, in both formats."""
+    long, limit = "x" * 70_000, '<limit effort="0" velocity="1" lower="-1" upper="1"/>'
+    urdf, xml = tmp_path / "robot.urdf", tmp_path / "robot.xml"
+    urdf.write_text(robot(link("a"), link(long), joint("a", long, "revolute", limit)))
+    xml.write_text(mjcf(limb(), f'<geom name="{long}" type="box" size="1 1 1"/>'))
+    for file in (urdf, xml):
+        with pytest.warns(UserWarning, match="xxx[.]{3}xxx") as found:
+            spo.load(file, contacts=True if file is xml else None)
+        assert max(len(str(one.message)) for one in found) < 1500
 
 
 @pytest.mark.parametrize("text", [robot(link("a"), link("b"), joint("a", "b"), head=REMOTE), robot(link("a"), DEEP)])
@@ -134,6 +148,7 @@ HOSTILE = {
     "a number of a megabyte": mjcf(limb(mass="9" * 1_000_000)),
     "an infinite mass": mjcf(limb(mass="inf")),
     "a place that is no number": mjcf(limb(pos="nan 0 0")),
+    "a size of less than nothing": mjcf(limb(), top='<asset><texture type="2d" width="-inf" height="4"/></asset>'),
     "a torn file": mjcf(limb())[:-25],
     "UTF-16": mjcf(limb("föö"), head='<?xml version="1.0" encoding="utf-16"?>').encode("utf-16"),
     "Latin-1": mjcf(limb("föö"), head='<?xml version="1.0" encoding="latin-1"?>').encode("latin-1"),

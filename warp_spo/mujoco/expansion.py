@@ -11,7 +11,7 @@ import math
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-from ..errors import shown
+from ..errors import quoted, shown
 
 MOST_ELEMENTS = 1_000_000
 MOST_ENTRIES = 100_000_000  # of a height field or a texture; of values that <size> reserves
@@ -68,7 +68,7 @@ def _part(file: Path, element: ET.Element, above: list[Path], seen: dict[Path, i
     try:
         place = part.resolve()
         if place in above:
-            _refuse(file, element, f"{part.name!r} leads to itself")
+            _refuse(file, element, f"{quoted(part.name)} leads to itself")
         if place not in seen and part.is_file():
             seen[place] = _check(part, ET.parse(part).getroot(), [*above, place], seen)
         return seen.get(place, 1)
@@ -88,7 +88,7 @@ def _number(element: ET.Element, name: str) -> int:
 def _whole(word: str) -> int:
     """Return a number as an integer, at most a little more than any bound here; 1 for text that is none."""
     try:
-        return int(min(float(word), 1e12))
+        return int(min(max(float(word), 0.0), 1e12))
     except ValueError:  # NaN, too
         return 1
 

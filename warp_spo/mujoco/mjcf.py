@@ -27,7 +27,7 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool = True, selection:
     tag = check_expansion(file)
     if tag != "mujoco":
         raise ValueError(
-            f"load: {str(file)!r} holds <{tag}>; expected <mujoco>; if it is URDF, let its name end in .urdf"
+            f"load: {str(file)!r} holds <{shown(tag)}>; expected <mujoco>; if it is URDF, let its name end in .urdf"
         )
     model, dropped, missing = compiled(file)
     source = Source(model, "load", str(file), missing)

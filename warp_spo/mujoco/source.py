@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import mujoco
 import numpy as np
 
-from ..errors import UnsupportedError
+from ..errors import UnsupportedError, quoted
 
 
 class Source:
@@ -49,7 +49,7 @@ class Source:
         """Return an element's kind and name for a message, such as ``joint 'knee'``."""
         name = self.name(kind, index)
         if name:
-            return f"{kind} {name!r}"
+            return f"{kind} {quoted(name)}"
         if kind in ("joint", "geom", "site"):
             owner = int(getattr(self.model, {"joint": "jnt_bodyid"}.get(kind, f"{kind}_bodyid"))[index])
             return f"{kind} {index} (no name) of {self.words('body', owner)}"

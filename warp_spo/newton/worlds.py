@@ -8,7 +8,7 @@ import newton
 import numpy as np
 from newton import JointType
 
-from ..errors import UnsupportedError
+from ..errors import UnsupportedError, quoted
 
 KINDS = {
     JointType.FIXED: "fixed",
@@ -271,7 +271,7 @@ def to_numpy(owner: Any, name: str) -> np.ndarray:
 
 def quote_labels(labels: list[str]) -> str:
     """Return the labels in quotes, the first eight of them and the number of the others."""
-    return ", ".join(repr(label) for label in labels[:8]) + (f" and {len(labels) - 8} more" if len(labels) > 8 else "")
+    return ", ".join(map(quoted, labels[:8])) + (f" and {len(labels) - 8} more" if len(labels) > 8 else "")
 
 
 def flat_entries(start: np.ndarray, joints: np.ndarray) -> np.ndarray:

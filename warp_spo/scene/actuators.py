@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import as_integer
+from ..errors import as_integer, quoted
 from .checks import checked_array
 
 UNBOUNDED = (-float("inf"), float("inf"))
@@ -83,7 +83,7 @@ class Actuator:
     label: str = ""
 
     def __post_init__(self) -> None:
-        call = f"Actuator({self.label!r})" if self.label else "Actuator"
+        call = f"Actuator({quoted(self.label)})" if self.label else "Actuator"
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
         hinges = (self.hinges,) if np.ndim(self.hinges) == 0 else tuple(self.hinges)
         indices = tuple(as_integer(hinge) for hinge in hinges)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..errors import UnsupportedError, as_integer
+from ..errors import UnsupportedError, as_integer, quoted
 from .contact_shapes import SHAPES, ContactShape, Placement
 from .contact_values import NeutralPose
 from .contacts import Contact
@@ -99,8 +99,8 @@ class CollisionShape:
 
     def words(self, bodies: Sequence[str]) -> str:
         """Return the shape's kind, name and body for a message; ``bodies`` are the labels of a scene's."""
-        name = f"{self.kind} {self.label!r}" if self.label else f"a {self.kind}"
-        return f"{name} of {'the world' if self.body < 0 else f'body {bodies[self.body]!r}'}"
+        name = f"{self.kind} {quoted(self.label)}" if self.label else f"a {self.kind}"
+        return f"{name} of {'the world' if self.body < 0 else f'body {quoted(bodies[self.body])}'}"
 
 
 CollisionFilter = Callable[[CollisionShape, CollisionShape], bool]
@@ -160,10 +160,14 @@ class ShapeSelection(NamedTuple):
         """
         if not self.wants(call):
             return scene, []
-        found = self.resolve(call, scene, shapes(), touches, material_rule, complete)
-        return scene.with_contacts(
-            [one for _, made in found.contacts_by_shape for one in made], found.ground
-        ), found.left_out
+        try:
+            found = self.resolve(call, scene, shapes(), touches, material_rule, complete)
+            contacts = [one for _, made in found.contacts_by_shape for one in made]
+            return scene.with_contacts(contacts, found.ground), found.left_out
+        except ValueError as error:  # of a contact, which knows neither the call nor the file
+            if not str(error).startswith(call):
+                error.args = (f"{call}: {error}",)
+            raise
 
     def unless(self, disabled: bool) -> tuple[ShapeSelection, list[str]]:
         """Return the selection for a source that may disable contacts, and in words what is left out: True obeys it."""
@@ -224,7 +228,7 @@ class ShapeSelection(NamedTuple):
         for pattern, count in self._patterns(call).items():
             found = [i for i, shape in enumerate(solid) if shape.matches(pattern, names[shape.body])]
             if not found and self.contacts is not True:
-                known = ", ".join(dict.fromkeys(repr(names[shape.body]) for shape in solid)) or "none"
+                known = ", ".join(dict.fromkeys(quoted(names[shape.body]) for shape in solid)) or "none"
                 raise ValueError(
                     f"{call}: contacts={pattern!r} matches no collision shape of a body that can move; "
                     f"expected a pattern of the names of bodies or shapes; bodies with shapes: {known}"

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import UnsupportedError, as_integer
+from ..errors import UnsupportedError, as_integer, quoted
 from .checks import checked_array, read_only
 from .contact_shapes import ARGUMENTS, SHAPES, ContactShape, ShapeArguments
 from .ground import HeightField, Listed, Plane
@@ -67,7 +67,7 @@ class Contact(ShapeArguments):
     radius: float = dataclasses.field(init=False, repr=False)  # of the sphere about each
 
     def __post_init__(self) -> None:
-        call = f"Contact({self.label!r})" if self.label else "Contact"
+        call = f"Contact({quoted(self.label)})" if self.label else "Contact"
         given = [name for name in ARGUMENTS if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"{call}: {', '.join(given) or 'no shape'} given; expected one of {', '.join(ARGUMENTS)}")
@@ -124,7 +124,7 @@ def check_contacts(contacts: Sequence[Contact], ground: Any, bodies: Sequence[An
     if ground is not None and not isinstance(ground, Plane | HeightField | Listed):
         raise TypeError(f"Scene: ground is of type {type(ground).__name__}; expected spo.Plane or spo.HeightField")
     for number, contact in enumerate(contacts):
-        name = f"contact {number} {contact.label!r}" if contact.label else f"contact {number}"
+        name = f"contact {number} {quoted(contact.label)}" if contact.label else f"contact {number}"
         index = as_integer(contact.body)
         if index is None:
             raise TypeError(f"Scene: {name} is on body {contact.body!r}; expected an integer")

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import UnsupportedError, as_integer
+from ..errors import UnsupportedError, as_integer, quoted
 from .contact_shapes import ConvexShape, as_pair, most_points
 
 STATIC_SINK = 1e-4  # how far the lighter body sinks in [m] that rests on the other one, where the stiffness is chosen
@@ -37,7 +37,7 @@ def contact_pairs(contacts: Sequence[Any], bodies: Sequence[Any]) -> tuple[Conta
     for index, contact in enumerate(contacts):
         if contact.other is None:
             continue
-        call = f"Scene: contact {index} {contact.label!r}" if contact.label else f"Scene: contact {index}"
+        call = f"Scene: contact {index} {quoted(contact.label)}" if contact.label else f"Scene: contact {index}"
         if contact.dissipation is not None:
             raise UnsupportedError(call, "dissipation= of a contact between bodies", "give damping=")
         partner = _partner(call, contact, contacts)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import UnsupportedError, as_integer
+from ..errors import UnsupportedError, as_integer, quoted
 from ..hinges.custom import MOST, Custom, check_custom_pose
 from ..hinges.elementary import BY_NAME, elements
 from ..hinges.hinge_type import FREE as FREE
@@ -93,7 +93,7 @@ class Body(StoredPart):
     any_inertia: bool = False
 
     def __post_init__(self) -> None:
-        call = f"Body({self.label!r})" if self.label else "Body"
+        call = f"Body({quoted(self.label)})" if self.label else "Body"
         if self.modes is not None and not isinstance(self.modes, Modes):
             raise TypeError(f"{call}: modes is {self.modes!r}; expected spo.Modes")
         object.__setattr__(self, "mass", float(checked_array(call, "mass [kg]", self.mass, ())))
@@ -192,7 +192,7 @@ class Hinge(StoredPart):
     )  # of warp_spo.hinges.hinge_type.ElementaryHinge, inboard first
 
     def __post_init__(self) -> None:
-        call = f"Hinge({self.label!r})" if self.label else f"Hinge({self.kind!r})"
+        call = f"Hinge({quoted(self.label)})" if self.label else f"Hinge({self.kind!r})"
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
         if isinstance(self.kind, str):
             put("kind", ALIASES.get(self.kind, self.kind))
@@ -264,7 +264,7 @@ class Hinge(StoredPart):
 
     def __getstate__(self) -> dict[str, Any]:
         if self.pose is not None:
-            check_function(f"Hinge({self.label!r})" if self.label else "Hinge.custom", "pose", self.pose)
+            check_function(f"Hinge({quoted(self.label)})" if self.label else "Hinge.custom", "pose", self.pose)
         return super().__getstate__()
 
     @property

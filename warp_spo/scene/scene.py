@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import refuse_masked, shown
+from ..errors import quoted, refuse_masked, shown
 from .actuators import RANGES, Actuator, Keyframe, actuator_values, check_actuator_value
 from .checks import SYMMETRY, refuse_gradient
 from .contact_values import CONTACT_VALUES, contact_values
@@ -182,7 +182,7 @@ class Scene(Stored):
 
     def _site(self, name: str, body: int, pose: Any) -> tuple[int, tuple[float, ...]]:
         """Return the body and the checked pose of a site."""
-        call = f"Scene: site {name!r}"
+        call = f"Scene: site {quoted(name)}"
         if not isinstance(body, int | np.integer) or not -1 <= body < len(self.bodies):
             raise ValueError(f"{call} is on body {body!r}; expected 0 to {len(self.bodies) - 1}, or -1")
         return int(body), tuple(checked_pose(call, "its pose", pose).tolist())
@@ -192,7 +192,7 @@ class Scene(Stored):
         sizes = (self.coord_count, self.dof_count, len(self.actuators))
         return Keyframe(
             *(
-                read_only(checked_array(f"Scene: keyframe {name!r}", field, array, (size,)))
+                read_only(checked_array(f"Scene: keyframe {quoted(name)}", field, array, (size,)))
                 for field, array, size in zip(Keyframe._fields, key, sizes, strict=True)
             )
         )
@@ -212,7 +212,7 @@ class Scene(Stored):
         carried: dict[int, str] = {}
         edges: list[Any] = [*self.hinges, *self.loops]
         for index, hinge in enumerate(edges):
-            name = f"hinge {index} {hinge.label!r}" if index < len(self.hinges) else f"loop {hinge.label!r}"
+            name = f"hinge {index} {quoted(hinge.label)}" if index < len(self.hinges) else f"loop {quoted(hinge.label)}"
             if not all(isinstance(body, int | np.integer) for body in (hinge.parent, hinge.child)):
                 raise TypeError(f"Scene: {name} joins body {hinge.parent!r} to body {hinge.child!r}; expected integers")
             if not (-1 <= hinge.parent < count and 0 <= hinge.child < count) or hinge.parent == hinge.child:
@@ -228,7 +228,7 @@ class Scene(Stored):
         if len(carried) < count:
             lost = next(body for body in range(count) if body not in carried)
             raise ValueError(
-                f"Scene: body {lost} {self.bodies[lost].label!r} is the child of no hinge; expected one "
+                f"Scene: body {lost} {quoted(self.bodies[lost].label)} is the child of no hinge; expected one "
                 f"hinge a body: add Hinge('free', -1, {lost}) to let it float"
             )
         for coupling in self.couplings:
@@ -248,7 +248,7 @@ class Scene(Stored):
             for index in actuator.hinges:
                 if not 0 <= index < len(self.hinges) or not self.hinges[index].driven:
                     raise ValueError(
-                        f"Scene: actuator {number} {actuator.label!r} names hinge {index}; expected one of "
+                        f"Scene: actuator {number} {quoted(actuator.label)} names hinge {index}; expected one of "
                         f"{len(self.hinges)} hinges with one coordinate"
                     )
 
@@ -415,7 +415,7 @@ class Scene(Stored):
     def check_value(self, call: str, name: str, value: Any) -> np.ndarray:
         """Return ``value`` as a checked float64 array [1 or worlds, ...] for ``values[name]``; ValueError otherwise."""
         if name not in self.values:
-            raise ValueError(f"{call}: unknown value {name!r}; expected one of {', '.join(sorted(self.values))}")
+            raise ValueError(f"{call}: unknown value {quoted(name)}; expected one of {', '.join(sorted(self.values))}")
         shape = self.values[name].shape[1:]
         refuse_masked(call, name, value)
         try:
@@ -450,7 +450,7 @@ class Scene(Stored):
         if refused.any():
             world, body = np.argwhere(refused)[0]
             raise ValueError(
-                f"{call}: body {body} {self.bodies[body].label!r} has the principal moments of inertia "
+                f"{call}: body {body} {quoted(self.bodies[body].label)} has the principal moments of inertia "
                 f"{', '.join(f'{moment:.3g}' for moment in moments[world, body])} kg m^2, and the last exceeds the sum "
                 "of the others, which no rigid body has; correct its inertia, or accept it with "
                 "Body(..., any_inertia=True)"

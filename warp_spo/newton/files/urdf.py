@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import UnsupportedError
+from ...errors import UnsupportedError, quoted
 from ...scene.collision_shapes import NONE, ShapeSelection
 from ...scene.parts import UNLIMITED, Body, Hinge
 from ...scene.scene import Scene
@@ -140,11 +140,11 @@ def _sort_joints(
         parent, child = _ends(joint)
         for link in (parent, child):
             if link not in links:
-                raise joint.error(f"there is no link {link!r}; expected one of the file's; correct the name")
+                raise joint.error(f"there is no link {quoted(link)}; expected one of the file's; correct the name")
         if carriers.setdefault(child, joint) is not joint:
             raise joint.error(
-                f"link {child!r} is the child of joint {carriers[child].get('name')!r}, too; expected one joint a "
-                "link; build a closed loop with Scene(loops=...)"
+                f"link {quoted(child)} is the child of joint {quoted(carriers[child].get('name'))}, too; expected one "
+                "joint a link; build a closed loop with Scene(loops=...)"
             )
         below[parent].append(joint)
 
@@ -173,7 +173,7 @@ def _hinge(joint: XmlElement, number: dict[str, int], label: Callable[[str], str
     """
     kind, (parent, child) = joint.needed("type"), _ends(joint)
     if kind not in KINDS:
-        raise joint.error(f"the type is {kind!r}; expected one of {', '.join(KINDS)}")
+        raise joint.error(f"the type is {quoted(kind)}; expected one of {', '.join(KINDS)}")
     values: dict[str, Any] = _resistances(joint) if kind != "fixed" else {}
     if kind in ("floating", "spherical"):
         values |= NO_LIMITS
@@ -280,7 +280,7 @@ def _limits(joint: XmlElement, kind: str) -> dict[str, float]:
         if lower > upper:
             absent = " (an absent one is 0)" if None in (limit.get("lower"), limit.get("upper")) else ""
             raise limit.error(
-                f"of joint {joint.get('name')!r}: lower is {lower:g}, above upper {upper:g}{absent}; "
+                f"of joint {quoted(joint.get('name'))}: lower is {lower:g}, above upper {upper:g}{absent}; "
                 "expected lower <= upper; swap them"
             )
         found["limit_lower"], found["limit_upper"] = np.clip([lower, upper], -UNLIMITED, UNLIMITED).tolist()
@@ -358,7 +358,9 @@ def _inertial(link: XmlElement) -> Inertial:
     parts = [inertial.child(tag) for tag in ("mass", "inertia")]
     for tag, part in zip(("mass", "inertia"), parts, strict=True):
         if part is None:
-            raise inertial.error(f"of link {link.get('name')!r}: no <{tag}>; expected <mass> and <inertia>; write it")
+            raise inertial.error(
+                f"of link {quoted(link.get('name'))}: no <{tag}>; expected <mass> and <inertia>; write it"
+            )
     mass, tensor = (part for part in parts if part is not None)
     xx, xy, xz, yy, yz, zz = (tensor.number(f"i{name}") for name in ("xx", "xy", "xz", "yy", "yz", "zz"))
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])

@@ -10,6 +10,7 @@ from typing import Any
 import newton
 import numpy as np
 
+from ...errors import quoted
 from .xml_source import XmlElement
 
 
@@ -58,7 +59,7 @@ def mesh_file(mesh: XmlElement, why: str) -> Path:
     for candidate in candidates:
         if candidate.is_file():
             return candidate
-    raise mesh.error(f"there is no file {name!r}; expected a mesh, {why}")
+    raise mesh.error(f"there is no file {quoted(name)}; expected a mesh, {why}")
 
 
 def unit_of(mesh: XmlElement, file: Path) -> float:
@@ -75,5 +76,5 @@ def unit_of(mesh: XmlElement, file: Path) -> float:
     except (ET.ParseError, ValueError):
         found = 0.0
     if not 0.0 < found < float("inf"):
-        raise mesh.error(f"its file {file.name!r} cannot be read, or has no unit of length; correct it")
+        raise mesh.error(f"its file {quoted(file.name)} cannot be read, or has no unit of length; correct it")
     return found

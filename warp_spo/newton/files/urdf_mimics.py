@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from typing import NamedTuple
 
-from ...errors import shown
+from ...errors import quoted, shown
 from ...scene.parts import Coupling
 from ..worlds import quote_labels
 from .xml_source import XmlElement
@@ -53,8 +53,8 @@ def read_mimics(joints: list[XmlElement]) -> Mimics:
             at = mimics[leader]
         if leader < 0:
             warnings.warn(
-                f"load: {str(mimic.file)!r}, line {mimic.line}: joint {joints[index].get('name')!r} mimics "
-                f"{at.get('joint')!r}, which is no joint of the file; it moves by itself; correct the name",  # type: ignore[union-attr]
+                f"load: {str(mimic.file)!r}, line {mimic.line}: joint {quoted(joints[index].get('name'))} mimics "
+                f"{quoted(at.get('joint'))}, which is no joint of the file; it moves by itself; correct the name",  # type: ignore[union-attr]
                 UserWarning,
                 stacklevel=4,
             )
@@ -63,9 +63,9 @@ def read_mimics(joints: list[XmlElement]) -> Mimics:
         for joint in (joints[index], *([] if stays else [joints[leader]])):
             if joint.get("type") not in SCALAR:
                 raise mimic.error(
-                    f"ties {joints[index].get('name')!r} to {joints[leader].get('name')!r}; joint "
-                    f"{joint.get('name')!r} is {joint.get('type')}; expected one of {', '.join(SCALAR)}; "
-                    "remove the mimic, or make both joints fixed"
+                    f"ties {quoted(joints[index].get('name'))} to {quoted(joints[leader].get('name'))}; joint "
+                    f"{quoted(joint.get('name'))} is {shown(str(joint.get('type')))}; expected one of "
+                    f"{', '.join(SCALAR)}; remove the mimic, or make both joints fixed"
                 )
         if stays:
             found.held[index] = offset

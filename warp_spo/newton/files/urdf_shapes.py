@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ...errors import quoted
 from ...scene.collision_shapes import CollisionShape
 from ...scene.contact_shapes import SHAPES, kinds_in
 from .urdf_masses import mesh_file, unit_of
@@ -109,5 +110,5 @@ def _urdf_friction(robot: XmlElement, link: Any) -> float | None:
             try:
                 return float(mu.get("value") or mu.text)
             except (TypeError, ValueError):
-                raise mu.error(f"is {mu.text!r}; expected a number") from None
+                raise mu.error(f"is {quoted(mu.text)}; expected a number") from None
     return None
