@@ -34,8 +34,9 @@ sums. A term may have its own: ``w.memory(name, size)`` reads it, ``w.keep(name,
 clears it. Random numbers are Philox 4x32-10 of (seed; number of the world in the whole run, step of the world, stage,
 number of the draw), so that a world's course depends neither on the device nor on the other worlds.
 
-A world whose actions, state or reward are not finite starts anew, ends with ``terminated``, reward 0, and is counted by
-its first cause; see ``env.log()``. Other worlds do not notice.
+A world whose actions, state, observations or rewards are not finite, or beyond :class:`Bounds`, starts anew, ends with
+``terminated``, reward 0, and is counted by its first cause; see ``env.log()``. No such number leaves the environment.
+Other worlds do not notice.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from . import actions, commands, events, observations, rewards, terminations
+from .bounds import Bounds
 from .observations import Observation, TorchTerm
 from .world import World
 
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
     from .environment import Env
 
 __all__ = [
+    "Bounds",
     "Env",
     "Observation",
     "TorchTerm",

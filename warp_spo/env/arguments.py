@@ -9,7 +9,8 @@ import torch
 
 from ..errors import UnsupportedError, is_bool, shown
 from ..scene.scene import Scene
-from .compile.step_kernels import NOT_FINITE
+from .bounds import Bounds
+from .compile.guard import BEYOND, NOT_FINITE
 from .observations import Observation, TorchTerm
 from .validation import check_function, check_mapping, check_number, check_whole
 
@@ -40,7 +41,7 @@ def checked_terms(
     terminations = check_mapping("Env", "terminations", terminations, "terms")
     for name, term in terminations.items():
         check_function("Env", f"terminations[{name!r}]", term)
-        if name == NOT_FINITE:
+        if name in (NOT_FINITE, BEYOND):
             raise ValueError(f"Env: terminations has {name!r}, which every environment has; expected another name")
     if not isinstance(events, list | tuple):
         raise TypeError(f"Env: events is {events!r}; expected a list of those of warp_spo.env.events")
@@ -91,6 +92,13 @@ def checked_bool(name: str, value: Any) -> bool:
     if not is_bool(value):
         raise ValueError(f"Env: {name} is {value!r}; expected True or False")
     return bool(value)
+
+
+def checked_bounds(bounds: Any) -> Bounds:
+    """Return bounds, those of defaults for None; TypeError for anything else."""
+    if not isinstance(bounds, Bounds | None):
+        raise TypeError(f"Env: bounds is {bounds!r}; expected warp_spo.env.Bounds, or None")
+    return bounds or Bounds()
 
 
 def checked_parts(actions: Any) -> list[Any]:

@@ -20,9 +20,11 @@ from ..runtime.launches import compile_side_by_side
 from ..runtime.torch_tensors import stream
 from ..scene.scene import Scene
 from . import arguments, checkpoint, seeding
+from .bounds import Bounds
 from .compile.buffers import Storage
 from .compile.cuda_graphs import Part, Replay, run_all
 from .compile.fused_kernel import Launch
+from .compile.guard import Guard
 from .compile.memory_layout import MemoryLayout
 from .compile.step_kernels import Tracing
 from .episode_log import Log, describe, explain
@@ -67,6 +69,7 @@ class Env(VecEnv):
         graph: whether a step is one CUDA graph; None: on CUDA it is.
         final_observations: whether ``extras["final_observations"]`` holds what was observed after the step and before
             new starts, the last observation of worlds whose episode has ended.
+        bounds: sizes of actions, states, observations and rewards that end a world; None: those of :class:`Bounds`.
         log_interval: steps after which ``extras["log"]`` comes again.
 
     Attributes:
@@ -106,6 +109,7 @@ class Env(VecEnv):
         graph: bool | None = None,
         log_interval: int = 24,
         final_observations: bool = False,
+        bounds: Bounds | None = None,
         cfg: Any = None,
     ):
         self.scene, self.num_envs = arguments.checked_scene(scene), worlds
@@ -120,7 +124,9 @@ class Env(VecEnv):
         self.final = arguments.checked_bool("final_observations", final_observations)
         default = arguments.checked_default(scene, default_q)
         terms = arguments.checked_terms(observations, rewards, terminations or {}, events)
-        self._layout = MemoryLayout(scene, default, self.step_dt, commands, changed_values(scene, events))
+        self.bounds = arguments.checked_bounds(bounds)
+        guard = Guard(self.bounds.limits(scene, self.dt, episode_length_s, list(terms[1]), terms[0]))
+        self._layout = MemoryLayout(scene, default, self.step_dt, commands, changed_values(scene, events), guard)
         tracing = self._trace(arguments.checked_parts(actions), *terms, commands, events)
         variable = self._layout.values
         self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=variable, granularity=granularity)
@@ -252,8 +258,8 @@ class Env(VecEnv):
         """Take one step in all worlds.
 
         Args:
-            actions: [world, action], a tensor or an array, on any device. A world whose actions are not finite starts
-                anew, and is counted.
+            actions: [world, action], a tensor or an array, on any device. A world whose actions are not finite, or
+                beyond their bound, starts anew, and is counted.
 
         Returns:
             Observations by group; rewards [world]; whether the episode ended, int [world]; a dictionary with
@@ -279,7 +285,7 @@ class Env(VecEnv):
 
     def log(self) -> dict[str, torch.Tensor]:
         """Return means over worlds' last finished episodes by name, and counts: ``warp_spo.env.episode_log.Log``."""
-        return self._log(self._tensors["memory"])
+        return self._log(self._tensors["memory"], self._tensors["faults"])
 
     def explain(self) -> str:
         """Return what a step consists of, and what it takes in memory."""

@@ -9,7 +9,6 @@ import torch
 from ..errors import shown
 from .compile.fused_kernel import Launch
 from .compile.memory_layout import MemoryLayout
-from .compile.step_kernels import CAUSES
 
 if TYPE_CHECKING:
     from .environment import Env
@@ -20,7 +19,8 @@ class Log:
 
     Means are over the worlds' last finished episodes, zero where there are none. "/episode/finished" is the number of
     worlds that have finished one, "/episode/whole" of those whose length counts: not where ``episode_length_buf`` was
-    written. "/not finite/" counts actions, states and rewards that were not.
+    written. "/not finite/" and "/beyond bounds/" count what ended worlds, by kind (action, state, reward, observation)
+    and by name, such as "/not finite/reward/alive".
 
     Args:
         layout: where the memory is. rewards, ends: names. device: of the memory. worlds: their number.
@@ -30,12 +30,19 @@ class Log:
         means = {f"/reward/{name}": f"last reward {name}" for name in rewards}
         means |= {f"/termination/{name}": f"last end {name}" for name in ends}
         means["/episode/seconds"] = "last seconds"
-        counts = {f"/not finite/{cause}": f"bad {cause}" for cause in CAUSES}
-        self._names = [*means, *counts, "/episode/finished", "/episode/whole"]
-        self._means, self._counts, self._episodes = (
+        causes = [f"/{name}" for name in layout.guard.names]
+        kinds = list(dict.fromkeys("/".join(name.split("/")[:3]) for name in causes))
+        sums = [*kinds, *(name for name in causes if name not in kinds)]
+        self._names = [*means, *sums, "/episode/finished", "/episode/whole"]
+        self._means, self._episodes = (
             torch.tensor([layout.memory[name][0] for name in names], device=device)
-            for names in (means.values(), counts.values(), ["episodes"])
+            for names in (means.values(), ["episodes"])
         )
+        belongs = [
+            [float(cause == name or (name in kinds and cause.startswith(f"{name}/"))) for cause in causes]
+            for name in sums
+        ]
+        self._belongs = torch.tensor(belongs, device=device)  # [count, cause]
         self._cut = torch.zeros(worlds, device=device)  # number of a world's episode whose age was written; 0: none
 
     def clear(self) -> None:
@@ -46,14 +53,14 @@ class Log:
         """Leave the lengths of the episodes that now go on where ``written`` [world] holds out of the report."""
         self._cut = torch.where(written, memory[self._episodes][0] + 1.0, self._cut)
 
-    def __call__(self, memory: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Return the report for the memory [number, world]."""
+    def __call__(self, memory: torch.Tensor, faults: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return the report for the memory [number, world] and what ended worlds [cause, world]."""
         episodes = memory[self._episodes][0]
         finished = (episodes > 0).float()
         whole = finished * (episodes != self._cut)
         rows = memory[self._means]  # the last one is of lengths
         means = [*(rows[:-1] @ share(finished)).unbind(), rows[-1] @ share(whole)]
-        found = [*means, *memory[self._counts].sum(dim=1).unbind(), finished.sum(), whole.sum()]
+        found = [*means, *(self._belongs @ faults.sum(dim=1)).unbind(), finished.sum(), whole.sum()]
         return dict(zip(self._names, found, strict=True))
 
 

@@ -79,14 +79,14 @@ class Observation:
         check_steps(call, "delay", self.delay)
         check_whole(call, "history", self.history, 1)
 
-    def trace(self, w: World) -> Vector:
-        """Return the numbers."""
+    def trace(self, w: World, admit: Callable[[Vector], Vector] = lambda values: values) -> Vector:
+        """Return the numbers; ``admit`` returns of what is measured what may be seen and remembered."""
         values = vector(np.atleast_1d(np.asarray(self.term(w), dtype=object)).ravel())
         if self.bias > 0.0:
             values = values + w.drawn(
                 f"bias {w.number(self)}", len(values), lambda s: [s.uniform(-self.bias, self.bias) for _ in values]
             )
-        values = vector(self._measurement(w, x) for x in values)
+        values = admit(vector(self._measurement(w, x) for x in values))
         least, most = check_steps("Observation", "delay", self.delay)
         if self.history + most == 1:
             return values

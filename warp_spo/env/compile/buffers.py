@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from .fused_kernel import COLUMN, INT, LONG, MASK, ROW, SHARED, Buffer
+from .fused_kernel import COLUMN, COUNT, FOUND, INT, LONG, MASK, ROW, SHARED, Buffer
 from .memory_layout import MemoryLayout
 
 CONTACT_ARRAYS = {"contact_f": 3, "contact_gap": 1, "contact_slip": 1}  # entries of each point, and of each pair
@@ -80,7 +80,8 @@ class Storage:
         """Return the tensors of worlds that steps change and read again, each with its axis of worlds, by name."""
         own = {name: buffer for name, buffer in self.buffers.items() if buffer.memory_order != SHARED}
         results = {self._output(name) for name in self.places}
-        return {n: (self.tensors[n], int(b.memory_order == COLUMN)) for n, b in own.items() if n not in results}
+        columns = (COLUMN, COUNT, FOUND)
+        return {n: (self.tensors[n], int(b.memory_order in columns)) for n, b in own.items() if n not in results}
 
     @property
     def bytes_per_world(self) -> int:
@@ -104,6 +105,8 @@ class Storage:
         self._add("qd", self._zeros(worlds, scene.dof_count))
         self._add("actions", self._zeros(worlds, layout.action_count))
         self._add("memory", self._zeros(max(1, layout.memory_size), worlds), COLUMN)
+        self._add("faults", self._zeros(len(layout.guard.names), worlds), COUNT)
+        self._add("found", self._zeros(len(layout.guard.places), worlds), FOUND)
         self._add("tick", self._zeros(worlds, dtype=torch.int32), INT)
         self._add("key", self._zeros(3, dtype=torch.int32), SHARED)
         self._add("advance", self._zeros(1) + 1.0, SHARED)
@@ -130,8 +133,9 @@ class Storage:
         if frames:
             self._add("frame_pose", self._zeros(worlds, frames, 7))
             self._add("frame_velocity", self._zeros(worlds, frames, 6))
+        if read & {"frame_acceleration", "qdd"}:
+            self.written["qdd"] = self._add("qdd", self._zeros(worlds, layout.scene.dof_count))
         if "frame_acceleration" in read:
-            self.written["qdd"] = self._zeros(worlds, layout.scene.dof_count)
             self._add("frame_acceleration", self._zeros(worlds, frames, 6))
 
     def _add_numbers(self, layout: MemoryLayout, tables: Mapping[str, torch.Tensor]) -> None:

@@ -14,6 +14,7 @@ from ...trace.emission import Emitter, Listing, RangeReduction, Store, render, r
 from ...trace.scalars import BRANCHES, Graph, Scalar, ordered
 
 ROW, COLUMN, INT, LONG, MASK, SHARED = "row", "column", "int", "long", "chosen", "shared"
+COUNT, FOUND = "count", "found"
 DRAW = "draw"  # random numbers of the thread's own
 ROW_NUMBER = "row_number"  # of the thread, where a world has many
 ROWS_AT_ONCE = 4  # of a thread, which share what is the same for all
@@ -30,7 +31,9 @@ class Buffer(NamedTuple):
         memory_order: ROW: float32 [world, entry]. COLUMN: float32 [entry, world],
             which neighbouring threads read side by side.
             SHARED: float32 [entry], the same for all worlds. INT: int32 [world]. LONG: int64 [world]. MASK: bool
-            [world].
+            [world]. COUNT: float32 [entry, world]; the value that a kernel stores is the number of the entry to which
+            one is added, counted from 1, and 0 for none. FOUND: float32 [entry, world]; a value below zero leaves the
+            entry as it is. It is stored last.
         passes: it is large, and no kernel reads it: it shall not displace from the caches what others read.
     """
 
@@ -49,6 +52,8 @@ class Buffer(NamedTuple):
         return {
             ROW: f"{name}.data[world * {entries} + {entry}]",
             COLUMN: f"{name}.data[(long long)({entry}) * worlds + world]",
+            FOUND: f"{name}.data[({entry}) * (long long)worlds + world]",
+            COUNT: f"{name}.data[((long long)({entry}) - 1) * worlds + world]",
             SHARED: f"{name}.data[{entry}]",
             INT: f"((int*){name}.data)[world]",
             LONG: f"((long long*){name}.data)[world]",
@@ -58,12 +63,16 @@ class Buffer(NamedTuple):
     def load(self, name: str, entry: str) -> str:
         """Return C++ that reads an entry as float."""
         place = self.place(name, entry)
-        return place if self.memory_order in (ROW, COLUMN, SHARED) else f"(float)({place})"
+        return place if self.memory_order in (ROW, COLUMN, SHARED, FOUND) else f"(float)({place})"
 
     def store(self, name: str, entry: str, value: str) -> str:
         """Return C++ that writes an entry."""
         if self.passes:
             return f"{self.set}({self.place(name, entry)}, {value});"
+        if self.memory_order == COUNT:
+            return f"if ({value} != 0) {self.place(name, value)} += 1;"
+        if self.memory_order == FOUND:
+            return f"if ({value} >= 0) {self.place(name, entry)} = {value};"
         kind = {INT: "(int)", LONG: "(long long)", MASK: "0 != "}.get(self.memory_order, "")
         return f"{self.place(name, entry)} = {kind}({value});"
 
@@ -114,6 +123,11 @@ class FusedKernel:
     def store(self, array: str, entry: int, value: Any) -> None:
         """Write a value to an entry of an array of the environment."""
         self.stores.append(Store(array, (entry,), value))
+
+    def store_of_row(self, array: str, entry: int, number: int, value: Any) -> None:
+        """Write a value that the thread's row ``number`` gives to an entry of a world's array."""
+        self.store(array, entry, value)
+        self.of_rows[number].append(self.stores[-1])
 
     def store_row(self, array: str, first: int, number: int, value: Any) -> None:
         """Write a value of the thread's row ``number`` to an array in which row 0 has the entry ``first``."""
@@ -168,7 +182,8 @@ class FusedKernel:
         def store(array: str, entry: str, value: str) -> str:
             if array in wide:
                 return f"PUT({array}, {buffers[array].tensor.shape[-1]}, {entry}, {value})"
-            return f"{'if (mine) ' if wide else ''}{buffers[array].store(array, entry + more, value)}"
+            own = more if buffers[array].memory_order == ROW else ""
+            return f"{'if (mine) ' if wide else ''}{buffers[array].store(array, entry + own, value)}"
 
         emitter = Emitter(
             "float32", load, store, lambda array, index: index[0], RangeReduction.FIRST, late=(DRAW,), fuses=True
@@ -215,8 +230,10 @@ class FusedKernel:
         """Return the listings of all statements, and their texts with what belongs between them."""
         read = self.read_arrays()
         at_once = lambda item: item.array not in read or (not wide and replaces(item))  # noqa: E731
-        late = [item for item in self.stores if not at_once(item)]  # after all reads of what they overwrite
-        early = [item for item in self.stores if at_once(item) and item.array not in wide]
+        last = [item for item in self.stores if buffers[item.array].memory_order == FOUND]  # depend on all others
+        others = [item for item in self.stores if buffers[item.array].memory_order != FOUND]
+        late = [item for item in others if not at_once(item)]  # after all reads of what they overwrite
+        early = [item for item in others if at_once(item) and item.array not in wide]
         if self.rows:
             listings = [emitter.region(items) for items in self.of_rows]
             *parts, last = (render(listing, "float32") for listing in listings)
@@ -233,7 +250,7 @@ class FusedKernel:
                     listings.append(emitter.region(inside))
                     parts += [f"BEGIN({start})", render(listings[-1], "float32")]
                     parts.append(f"FLUSH({name}, {entries}, {start}, {part}, {buffers[name].set})")
-        listings.append(emitter.region(late))
+        listings.append(emitter.region([*late, *last]))
         return listings, [*parts, render(listings[-1], "float32")]
 
 

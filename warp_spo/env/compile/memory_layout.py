@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...scene.scene import Scene
+from .guard import Guard
 from .vectors import find
 
 
@@ -23,10 +24,19 @@ class MemoryLayout:
         tables: numbers that all worlds share, by their names in kernels. table_names: names that terms give them.
         weights: of rewards.
         values: names of the scene's values that differ between worlds.
+        guard: what ends worlds whose numbers are out of bounds.
         outputs: names under which kernels write results ("reward", a group of observations, ...), by result.
     """
 
-    def __init__(self, scene: Scene, default_q: np.ndarray, step_dt: float, commands: Any, values: tuple[str, ...]):
+    def __init__(
+        self,
+        scene: Scene,
+        default_q: np.ndarray,
+        step_dt: float,
+        commands: Any,
+        values: tuple[str, ...],
+        guard: Guard,
+    ):
         self.scene, self.default_q, self.step_dt, self.commands, self.values = (
             scene,
             default_q,
@@ -34,6 +44,7 @@ class MemoryLayout:
             commands,
             values,
         )
+        self.guard = guard
         self.action_count = 0
         self.action_arrays: set[str] = set()
         self.biased: list[int] = []

@@ -13,26 +13,17 @@ from typing import Any
 import numpy as np
 
 from ...trace.functions import AbstractScalar, Condition, where
-from ...trace.scalars import Value, absolute, branch, less
+from ...trace.scalars import branch
+from ..bounds import term_labels
 from ..events import EncoderBias, Interval, Reset, Start, Values
 from ..observations import Observation, name_of
 from ..world import World
 from .fused_kernel import FusedKernel
+from .guard import BEYOND, LARGEST, NOT_FINITE, Check, first, within
 from .memory_layout import MemoryLayout
 from .vectors import Vector, as_condition, as_value, vector
 
-LARGEST = 1e30  # numbers beyond it count as not finite
-CAUSES = ("action", "state", "reward")  # of ends for numbers that are not finite, the first first
-NOT_FINITE = "not finite"
 CHOSEN_WORLD = "chosen.data[world]"  # C++: the world has just started anew
-
-
-def is_finite(values: Any) -> Condition:
-    """Return whether all numbers are finite, and their sizes add up to less than 1e30."""
-    total: Value = 0.0
-    for x in values:
-        total = total + absolute(x.value if isinstance(x, AbstractScalar) else float(x))
-    return Condition(less(total, LARGEST))
 
 
 class Tracing:
@@ -54,7 +45,7 @@ class Tracing:
         commands: Any,
         events: list,
     ):
-        self.layout, self.actions, self.groups = layout, actions, groups
+        self.layout, self.actions, self.groups, self.guard = layout, actions, groups, layout.guard
         layout.weights = {name: weight for name, (weight, _) in rewards.items()}
         self.rewards, self.terminations, self.commands, self.events = rewards, terminations, commands, events
         for event in events:
@@ -66,7 +57,7 @@ class Tracing:
                         "Env: events has two encoder_bias; expected one, whose names= are several expressions"
                     )
                 layout.biased = World(layout, FusedKernel("none", 0)).joints(event.names)
-        self.ends = [*terminations, NOT_FINITE]
+        self.ends = [*terminations, NOT_FINITE, BEYOND]
         names = ("act", "judge", "observe", "reset", "start", "final")
         self.stages = {name: FusedKernel(name, stream) for stream, name in enumerate(names)}
         self.group_sizes: dict[str, int] = {}
@@ -99,6 +90,8 @@ class Tracing:
 
     def run(self, steps: int, final: bool) -> None:
         """Trace all stages; ``steps`` are those of an episode; ``final`` asks for the stage of that name."""
+        self.final = final
+        self.guard.apart = [cause for terms in self._causes().values() for cause, term in terms if term.rows]
         self._act()
         self._judge(steps)
         self._observe()
@@ -114,15 +107,12 @@ class Tracing:
         w = self.act = World(self.layout, stage)
         count = self.layout.action_count
         given = w.read("actions", count)
-        finite = is_finite(given)
-        action = vector(where(finite, x, 0.0) for x in given)
+        checks: list[Check] = []
+        action = self.guard.admit("action", given, checks)
         w.keep("action 2", w.memory("action 1", count))
         w.keep("action 1", w.memory("action", count))
         w.keep("action", action)
-        bad = w.memory("bad action", 1, reset=None)[0]
-        w.keep("bad action", [bad + where(finite, 0.0, 1.0)])
-        w.memory("spoilt", 1)
-        w.keep("spoilt", [where(finite, 0.0, 1.0)])
+        self.guard.leave(w, "actions", checks)
         at = 0
         for part in self.actions:
             size = len(part.labels(w.scene))
@@ -139,20 +129,24 @@ class Tracing:
         w = self.judge = World(self.layout, stage)
         length = w.read("episode_length", 1)[0] + 1.0
         w.__dict__["time"] = length * self.layout.step_dt
-        spoilt = w.memory("spoilt", 1)[0] > 0.5
-        sane = is_finite([*w.q, *w.qd])
+        state = self.guard.check_state(w)
+        checks = [*self.guard.read_observations(w, ""), self.guard.read(w, "actions"), *state]
         total: Any = 0.0
+        earned = {}
         for name, (weight, term) in self.rewards.items():
             value = weight * self.layout.step_dt * scalar(f"reward {name!r}", term(w))
             total = total + value
-            earned = where(is_finite([value]), value, 0.0)
-            w.keep(f"sum reward {name}", w.memory(f"sum reward {name}", 1) + earned)
-        fine = is_finite([total])
-        bad = ~sane | spoilt | ~fine
-        self._count(w, "state", ~sane & ~spoilt)
-        self._count(w, "reward", sane & ~fine)
-        ends = {name: as_condition(term(w)) for name, term in self.terminations.items()} | {NOT_FINITE: bad}
-        terminated = ends[NOT_FINITE]
+            checks.append(self.guard.check(f"reward/{name}", [value]))
+            earned[name] = value
+        fault = first([*checks, *(self.guard.read_observations(w, "final ") if self.final else ())], "fault")
+        bad = fault > 0.5
+        stage.store("faults", 0, as_value(fault))
+        for name, value in earned.items():
+            w.keep(f"sum reward {name}", w.memory(f"sum reward {name}", 1) + where(bad, 0.0, value))
+        ends = {name: as_condition(term(w)) for name, term in self.terminations.items()} | self.guard.ends(fault)
+        self.bad, self.ended = bad, self._without(w, state)
+        self._hold(w, list(w.kept))
+        terminated = bad
         for name in self.terminations:
             terminated = terminated | ends[name]
         late = length >= float(steps)
@@ -172,15 +166,29 @@ class Tracing:
             w.keep(name, [value])
         self._start(w, done, intervals=True)
 
-    def _count(self, w: World, cause: str, holds: Condition) -> None:
-        old = w.memory(f"bad {cause}", 1, reset=None)
-        w.keep(f"bad {cause}", choose(holds, old + 1.0, old, f"bad {cause}"))
+    def _without(self, w: World, state: list[Check]) -> World:
+        """Return the world at the end of its episode, at rest in default_q where its state is out of bounds."""
+        ended = World(self.layout, w._stage)
+        ended.__dict__.update(w.__dict__)
+        fine = Condition(1.0)
+        for check in state:
+            fine = fine & check.fine
+        ended.__dict__["q"] = vector(where(fine, x, float(y)) for x, y in zip(w.q, self.layout.default_q, strict=True))
+        ended.__dict__["qd"] = vector(where(fine, x, 0.0) for x in w.qd)
+        return ended
+
+    def _hold(self, w: World, names: list[str]) -> None:
+        """Leave memory that resets leave alone as it was in worlds that the guard ends."""
+        for name in names:
+            if self.layout.memory[name][2] is None:
+                pairs = zip(w.stored_memory(name), w.kept[name], strict=True)
+                w.keep(name, [where(self.bad, old, new) for old, new in pairs])
 
     def _start(self, w: World, done: Condition, intervals: bool) -> None:
         """Start worlds anew where ``done`` holds; let events happen and draw commands in the others."""
         stage = w._stage
         fresh = World(self.layout, stage)
-        fresh.before = w if intervals else None
+        fresh.before = self.ended if intervals else None
         fresh.__dict__["q"] = vector(float(x) for x in self.layout.default_q)
         fresh.__dict__["qd"] = vector(0.0 for _ in range(w.scene.dof_count))
         for event in self.events:
@@ -211,7 +219,11 @@ class Tracing:
     ) -> tuple[Vector, Vector]:
         """Return the state after an event, which is that of ``changed`` where ``due`` holds, and keep what it kept."""
         olds = [w.kept.get(each, w.stored_memory(each)) for each in changed.kept]
-        news = np.concatenate([changed.q, changed.qd, *changed.kept.values()])
+        finite = [
+            [where(within(values, LARGEST), a, b) for a, b in zip(values, old, strict=True)]
+            for values, old in zip(changed.kept.values(), olds, strict=True)
+        ]
+        news = np.concatenate([changed.q, changed.qd, *finite])
         found = choose(due, news, np.concatenate([q, qd, *olds]), name)
         sizes = [len(q), len(qd), *map(len, olds)]
         q, qd, *kept = np.split(found, np.cumsum(sizes)[:-1])
@@ -295,7 +307,7 @@ class Tracing:
             return World(self.layout, one, fresh=Condition(one.graph.input("chosen", 0)))
 
         self.observed = begin(stage)
-        self._observe_groups(self.observed, begin, "")
+        self.found = self._observe_groups(self.observed, begin, "")
 
     def _final(self) -> None:
         """Observe the state in which an episode ends, before worlds start anew."""
@@ -307,12 +319,16 @@ class Tracing:
 
         self._observe_groups(begin(self.stages["final"]), begin, "final ")
 
-    def _observe_groups(self, w: World, begin: Callable[[FusedKernel], World], kind: str) -> None:
-        """Store the observations of all groups: of ``w``, or of the rows of a world that ``begin`` makes of a stage."""
+    def _observe_groups(self, w: World, begin: Callable[[FusedKernel], World], kind: str) -> Any:
+        """Store the observations of all groups: of ``w``, or of the rows of a world that ``begin`` makes of a stage.
+
+        Returns what the guard found in those of ``w``.
+        """
         of_rows: dict[int, World] = {}
+        causes, checks = self._causes(), []  # type: ignore[var-annotated]
         for group, terms in self.groups.items():
             name, at, starts = self.layout.output(kind + group), 0, [0]
-            for term in terms:
+            for (cause, _), term in zip(causes[group], terms, strict=True):
                 rows = term.rows
                 if rows:
                     self.apart.add(kind + group)
@@ -321,30 +337,51 @@ class Tracing:
                         self.stages[f"{w._stage.name}, {rows} rows"] = stage
                         of_rows[rows] = begin(stage)
                     one, stage = of_rows[rows], of_rows[rows]._stage
+                    goes = self._goes(one) if kind == "" else None
                     for number in range(stage.at_once):
-                        stage.store_row(name, at, number, as_value(term.trace_row(one, number)))
+                        found: list[Check] = []
+                        (value,) = self.guard.admit(cause, [term.trace_row(one, number)], found)
+                        stage.store_row(name, at, number, as_value(value))
+                        self.guard.leave_row(one, kind, cause, found[0], number, goes)
                     at += rows
                 else:
-                    for value in term.trace(w):
+                    for value in term.trace(w, lambda values: self.guard.admit(cause, values, checks)):  # noqa: B023
                         w._stage.store(name, at, as_value(value))
                         at += 1
                 starts.append(at)
             self.group_sizes[group], self.term_sizes[group] = at, np.diff(starts).tolist()
+        return self.guard.leave(w, f"{kind}observations", checks, self._goes(w) if kind == "" else None)
+
+    def _causes(self) -> dict[str, list[tuple[str, Observation]]]:
+        """Return the terms of each group with what the guard counts them as."""
+        return {
+            group: [
+                (f"observation/{group}/{label}", term) for label, term in zip(term_labels(terms), terms, strict=True)
+            ]
+            for group, terms in self.groups.items()
+        }
+
+    @staticmethod
+    def _goes(w: World) -> Condition:
+        """Return whether a look at the world is a step of its own; one after a reset of others is not."""
+        return (w.read("advance", 1)[0] > 0.5) | w.fresh
 
     # -- memory ----------------------------------------------------------------------------------------------------
     def _close(self) -> None:
         """Store what each stage keeps; what a reset clears is cleared by the stage that resets."""
         for name, values in self.act.kept.items():
             self._keep(self.act, name, values)
-        if self.observed.kept:  # a look at worlds that go on, after a reset of others, is not a step of theirs
-            goes = (self.observed.read("advance", 1)[0] > 0.5) | self.observed.fresh
-            for name, values in self.observed.kept.items():
-                old = self.observed.stored_memory(name)
-                self._keep(self.observed, name, vector(where(goes, a, b) for a, b in zip(values, old, strict=True)))
+        goes = self._goes(self.observed)
+        for name, values in self.observed.kept.items():
+            old = self.observed.stored_memory(name)
+            due = goes & (self.found < 0.5) if self.layout.memory[name][2] is None else goes
+            self._keep(self.observed, name, vector(where(due, a, b) for a, b in zip(values, old, strict=True)))
         for name, (_, _, update) in self.layout.sensors.items():
             if name not in self.judge.kept:
                 update(self.judge)
+                self._hold(self.judge, [name])
         self._clear(self.judge, self.done)
+        self.guard.clear(self.judge, self.done)
 
     def _clear(self, w: World, done: Condition) -> None:
         """Store the memory that a stage keeps; where ``done`` holds, memory with a reset value takes that value."""
@@ -374,6 +411,7 @@ class Tracing:
         self._start(w, chosen, intervals=False)
         stage.store("episode_length", 0, as_value(where(chosen, 0.0, w.read("episode_length", 1)[0])))
         self._clear(w, chosen)
+        self.guard.clear(w, chosen)
 
 
 def choose(due: Condition, news: Any, olds: Any, name: str) -> Vector:

@@ -25,7 +25,7 @@ def task(name: str) -> Any:
     return importlib.import_module(f".{TASKS[name]}", __package__)
 
 
-OPEN = ("first_world", "passes", "granularity", "graph", "log_interval", "final_observations", "cfg")
+OPEN = ("first_world", "passes", "granularity", "graph", "log_interval", "final_observations", "bounds", "cfg")
 """Arguments of ``Env`` that tasks leave to the caller."""
 
 
