@@ -20,6 +20,7 @@ from ..runtime.launches import compile_side_by_side
 from ..runtime.torch_tensors import stream
 from ..scene.scene import Scene
 from . import arguments, checkpoint, seeding
+from .commands import COMMAND, HELD
 from .compile.buffers import Storage
 from .compile.cuda_graphs import Part, Replay, run_all
 from .compile.fused_kernel import Launch
@@ -27,6 +28,7 @@ from .compile.memory_layout import MemoryLayout
 from .compile.step_kernels import Tracing
 from .episode_log import Log, describe, explain
 from .events import Delays, Values, changed_values
+from .held_tensor import HeldTensor
 from .observations import TorchTerm
 from .validation import check_whole
 
@@ -163,7 +165,7 @@ class Env(VecEnv):
 
     def _delay_buffers(self, events: Sequence[Any]) -> Any:
         """Return the buffers of actuators with delays, None where there are none."""
-        delays = [int(each.delay) for each in self.scene.actuators]
+        delays = [int(each) for each in self.scene.values["actuator_delay"].ravel()]
         delays += [event.longest for event in events if isinstance(event, Delays)]
         if "ctrl" not in self._controls or max(delays, default=0) == 0:
             return None
@@ -198,16 +200,25 @@ class Env(VecEnv):
                 f"Env.memory: unknown name {name!r}; expected one of {', '.join(map(shown, self._layout.memory))}"
             )
         start, size, _ = self._layout.memory[name]
-        return self._tensors["memory"][start : start + size].t()
+        found = self._tensors["memory"][start : start + size].t()
+        return HeldTensor.of(found, self.memory(HELD)) if name == COMMAND and self.has_commands else found
 
     @property
     def command(self) -> torch.Tensor:
-        """The commands [world, command]; they may be written."""
+        """The commands [world, command]; they may be written.
+
+        What is written is held from then on, through redraws, headings and new episodes, until a ``reset`` with a seed,
+        or until ``env.memory("command held")`` [world, command], 1 where a number is held, is set to 0.
+        """
         if not self.has_commands:
             raise ValueError(
                 "Env.command: this environment gives no commands; expected one that was made with commands="
             )
-        return self.memory("command")
+        return self.memory(COMMAND)
+
+    @command.setter
+    def command(self, value: Any) -> None:
+        self.command[:] = value
 
     # -- stepping --------------------------------------------------------------------------------------------------
     def get_observations(self) -> Any:
