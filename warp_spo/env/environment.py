@@ -132,6 +132,10 @@ class Env(VecEnv):
         self._step_options = StepOptions(substeps=self.decimation, passes=self._passes)
         self.values, self._actuator_state = store.values, self._delay_buffers(events)
         self._log = Log(self._layout, self.reward_names, self.termination_names, self.device, worlds)
+        points, seen = len(scene.contact_points), tracing.observed_entries
+        of_pairs = any(array == "contact_gap" and entry >= points for array, entry in seen)
+        held = (self.q, self.qd, self._tensors["contact_gap"]) if of_pairs else ()
+        self._spare = tuple(map(torch.zeros_like, held))
         self._kernels = self._build(tracing)
         wanted = self.warp_device.is_cuda if graph is None else bool(graph) and self.warp_device.is_cuda
         self.replay = Replay(self._parts(), wanted)
@@ -399,7 +403,17 @@ class Env(VecEnv):
             self._set_values()
         if self._actuator_state is not None:
             self.dyn.reset_actuator_state(self.chosen, self._actuator_state)
+        if self._spare:
+            self._measure_pairs()
         self._after("observe")
+
+    def _measure_pairs(self) -> None:
+        """Find the gaps of pairs of bodies where worlds have started anew, by a step that leads nowhere."""
+        q, qd, found = self._spare
+        report = StepReport(contact_gap=found)
+        self.dyn.step(self.q, self.qd, dt=self.dt, options=StepOptions(passes=1), report=report, out=(q, qd))
+        gap, points = self._tensors["contact_gap"], len(self.scene.contact_points)
+        gap[:, points:] = torch.where(self.chosen[:, None], found[:, points:], gap[:, points:])
 
     def _after(self, stage: str) -> None:
         """Compute what a stage reads of the new state."""
