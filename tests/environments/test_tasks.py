@@ -299,7 +299,7 @@ def test_g1_is_rewarded_for_steps_in_time():
         turn = env.step_dt * step / g1_flat.STRIDE
         wanted = [[np.sin(2 * np.pi * turn), np.cos(2 * np.pi * turn)]] * 2 + [[0.0, 0.0]]
         assert np.allclose(observed["actor"][:, -2:], wanted, atol=1e-4)
-        touches = env.memory(f"feet {g1_flat.FEET} 1.0")[:, 2:4] > 0.0  # times of contact
+        touches = env.memory(f"feet {g1_flat.FEET!r} 1.0")[:, 2:4] > 0.0  # times of contact
         stance = torch.tensor([abs((turn - foot / 2 + 0.5) % 1 - 0.5) < 0.3 for foot in (0, 1)])
         right = torch.stack([touches[0] == stance, touches[1] == stance, touches[2]]).float().mean(dim=1)
         sums.append(env.memory("sum reward in step")[:, 0].clone())
@@ -322,11 +322,11 @@ def test_ants_are_paid_for_a_trot_of_all_legs():
     for step in range(40):
         _, _, done, _ = env.step(2.0 * torch.randn(32, 8) * (torch.arange(32) % 2)[:, None])  # every other one stands
         going = done == 0
-        touches = env.memory(f"feet {ant.FEET} 1.0")[:, 4:8] > 0.0  # times of contact
+        touches = env.memory(f"feet {ant.FEET!r} 1.0")[:, 4:8] > 0.0  # times of contact
         gap = env.dyn.frame_poses(env.q, feet)[:, :, 2] - 0.08
         fl, hl, hr, fr = touches.T
         rules = (fl == hr).float() + (hl == fr).float() + (fl != fr).float() + (hl != hr).float()
-        since = env.memory(f"stepping {ant.FEET} 0.05").clone()
+        since = env.memory(f"stepping {ant.FEET!r} 0.05") * env.step_dt
         clear = torch.cat([torch.ones_like(touches), (gap - 0.05).abs() > 0.04], dim=1) & going[:, None]
         wanted = torch.where(torch.cat([touches, gap > 0.05], dim=1), torch.zeros(()), times + env.step_dt)
         assert torch.allclose(since[clear], wanted[clear], atol=1e-4), step

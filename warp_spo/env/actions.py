@@ -49,9 +49,10 @@ class Control:
         labels = actuator_labels(scene)
         return list(every) if self.actuators is None else find("actions.Control", "actuator", labels, self.actuators)
 
-    def gears(self, scene: Scene) -> np.ndarray:
-        """Return the factor from each hinge's coordinate to its actuator's length."""
-        return np.array([scene.actuators[i].gear[0] for i in self.entries(scene)])
+    def gears(self, w: World) -> np.ndarray:
+        """Return the factor from each hinge's coordinate to its actuator's length, of the world."""
+        firsts = np.cumsum([0, *(len(each.hinges) for each in w.scene.actuators)])
+        return w.value("actuator_gear")[firsts[self.entries(w.scene)]]
 
     def hinges(self, scene: Scene) -> list[int]:
         """Return the hinge of each action."""
@@ -67,7 +68,7 @@ class Control:
         offset: Any
         if isinstance(self.offset, str) and self.offset == "default":
             at = [int(w.scene.q_start[hinge]) for hinge in self.hinges(w.scene)]
-            offset = self.gears(w.scene) * (w.default_q[at] - w.encoder_bias(self.hinges(w.scene)))
+            offset = self.gears(w) * (w.default_q[at] - w.encoder_bias(self.hinges(w.scene)))
         else:
             offset = spread(type(self).__name__, "offset", self.offset, labels)
         limited = action if self.clip is None else [clip(x, *self.clip) for x in action]
@@ -110,9 +111,9 @@ class Position:
         """Return which entries of the array the actions set."""
         return [int(scene.q_start[i]) for i in self.hinges(scene)]
 
-    def gears(self, scene: Scene) -> np.ndarray:
+    def gears(self, w: World) -> np.ndarray:
         """Return the factor from each hinge's coordinate to its target."""
-        return np.ones(len(self.hinges(scene)))
+        return np.ones(len(self.hinges(w.scene)))
 
     trace = Control.trace
 

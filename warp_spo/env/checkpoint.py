@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .environment import Env
 
 STEPS = "steps"  # of the environment, after which a log comes
+CUT = "episode of a written length"  # in the log of the environment
 
 
 def level_names(events: Sequence[Any], commands: Any) -> list[str]:
@@ -116,7 +117,7 @@ def _by_world(env: Env) -> dict[str, tuple[torch.Tensor, int]]:
     """Return the tensors of :func:`copy_worlds` and their axes of worlds."""
     delays = {f"actuator state {i}": (part, 0) for i, part in enumerate(env._actuator_state or ())}
     seen = {f"seen {name}": (env._store.part(env._store.out, name), 0) for name in env.num_obs}
-    return env._store.worlds_of() | delays | seen
+    return env._store.worlds_of() | delays | seen | {CUT: (env._log.cut, 0)}
 
 
 def _check_tensors(what: str, given: Any) -> None:
@@ -128,7 +129,8 @@ def _check_tensors(what: str, given: Any) -> None:
 def _tensors(env: Env) -> dict[str, torch.Tensor]:
     """Return the tensors themselves."""
     delays = env._actuator_state or ()
-    return env._store.changing() | {f"actuator state {i}": part for i, part in enumerate(delays)}
+    named = {f"actuator state {i}": part for i, part in enumerate(delays)}
+    return env._store.changing() | named | {CUT: env._log.cut}
 
 
 reduce = never_copied(

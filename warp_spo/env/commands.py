@@ -13,6 +13,7 @@ from .compile.vectors import Vector, vector
 from .validation import Range, check_interval, check_number, check_optional_span, check_span
 from .world import World
 
+COMMAND, HELD = "command", "command held"  # names under which a world remembers its command, and 1 where it is held
 LEVEL = "command level"  # name under which a world remembers by how much its share has grown
 
 
@@ -105,7 +106,7 @@ class Velocity:
         if self.still > 0.0:
             slow = np.hypot(values[0], values[1]) < self.still
             values[:2] = [where(slow, 0.0, x) for x in values[:2]]
-        found = {"command": vector(where(stands, 0.0, x) for x in values)}
+        found = {COMMAND: vector(where(stands, 0.0, x) for x in values)}
         if self.heading is not None:
             found["command heading"] = vector([w.uniform(*self.heading), where(stands, 0.0, 1.0)])
         return found
@@ -144,7 +145,7 @@ class Uniform:
 
     def draw(self, w: World, done: Condition | None) -> dict[str, Vector]:
         """Return a new command, by the name of the memory."""
-        return {"command": vector(w.uniform(*each) for each in self.ranges)}
+        return {COMMAND: vector(w.uniform(*each) for each in self.ranges)}
 
     def update(self, w: World, command: Vector) -> Vector:
         """Return the command of this step."""

@@ -21,6 +21,7 @@ from ..runtime.torch_tensors import stream
 from ..scene.scene import Scene
 from . import arguments, checkpoint, seeding
 from .bounds import Bounds
+from .commands import COMMAND, HELD
 from .compile.buffers import Storage
 from .compile.cuda_graphs import Part, Replay, run_all
 from .compile.fused_kernel import Launch
@@ -29,6 +30,7 @@ from .compile.memory_layout import MemoryLayout
 from .compile.step_kernels import Tracing
 from .episode_log import Log, describe, explain
 from .events import Delays, Values, changed_values
+from .held_tensor import HeldTensor
 from .observations import TorchTerm
 from .validation import check_whole
 
@@ -136,6 +138,10 @@ class Env(VecEnv):
         self._step_options = StepOptions(substeps=self.decimation, passes=self._passes)
         self.values, self._actuator_state = store.values, self._delay_buffers(events)
         self._log = Log(self._layout, self.reward_names, self.termination_names, self.device, worlds)
+        points, seen = len(scene.contact_points), tracing.observed_entries
+        of_pairs = any(array == "contact_gap" and entry >= points for array, entry in seen)
+        held = (self.q, self.qd, self._tensors["contact_gap"]) if of_pairs else ()
+        self._spare = tuple(map(torch.zeros_like, held))
         self._kernels = self._build(tracing)
         wanted = self.warp_device.is_cuda if graph is None else bool(graph) and self.warp_device.is_cuda
         self.replay = Replay(self._parts(), wanted)
@@ -169,7 +175,7 @@ class Env(VecEnv):
 
     def _delay_buffers(self, events: Sequence[Any]) -> Any:
         """Return the buffers of actuators with delays, None where there are none."""
-        delays = [int(each.delay) for each in self.scene.actuators]
+        delays = [int(each) for each in self.scene.values["actuator_delay"].ravel()]
         delays += [event.longest for event in events if isinstance(event, Delays)]
         if "ctrl" not in self._controls or max(delays, default=0) == 0:
             return None
@@ -204,16 +210,25 @@ class Env(VecEnv):
                 f"Env.memory: unknown name {name!r}; expected one of {', '.join(map(shown, self._layout.memory))}"
             )
         start, size, _ = self._layout.memory[name]
-        return self._tensors["memory"][start : start + size].t()
+        found = self._tensors["memory"][start : start + size].t()
+        return HeldTensor.of(found, self.memory(HELD)) if name == COMMAND and self.has_commands else found
 
     @property
     def command(self) -> torch.Tensor:
-        """The commands [world, command]; they may be written."""
+        """The commands [world, command]; they may be written.
+
+        What is written is held from then on, through redraws, headings and new episodes, until a ``reset`` with a seed,
+        or until ``env.memory("command held")`` [world, command], 1 where a number is held, is set to 0.
+        """
         if not self.has_commands:
             raise ValueError(
                 "Env.command: this environment gives no commands; expected one that was made with commands="
             )
-        return self.memory("command")
+        return self.memory(COMMAND)
+
+    @command.setter
+    def command(self, value: Any) -> None:
+        self.command[:] = value
 
     # -- stepping --------------------------------------------------------------------------------------------------
     def get_observations(self) -> Any:
@@ -394,7 +409,17 @@ class Env(VecEnv):
             self._set_values()
         if self._actuator_state is not None:
             self.dyn.reset_actuator_state(self.chosen, self._actuator_state)
+        if self._spare:
+            self._measure_pairs()
         self._after("observe")
+
+    def _measure_pairs(self) -> None:
+        """Find the gaps of pairs of bodies where worlds have started anew, by a step that leads nowhere."""
+        q, qd, found = self._spare
+        report = StepReport(contact_gap=found)
+        self.dyn.step(self.q, self.qd, dt=self.dt, options=StepOptions(passes=1), report=report, out=(q, qd))
+        gap, points = self._tensors["contact_gap"], len(self.scene.contact_points)
+        gap[:, points:] = torch.where(self.chosen[:, None], found[:, points:], gap[:, points:])
 
     def _after(self, stage: str) -> None:
         """Compute what a stage reads of the new state."""

@@ -24,6 +24,9 @@ class Log:
 
     Args:
         layout: where the memory is. rewards, ends: names. device: of the memory. worlds: their number.
+
+    Attributes:
+        cut: number of the episode of each world whose age was written, 0 where none was [world].
     """
 
     def __init__(self, layout: MemoryLayout, rewards: list[str], ends: list[str], device: torch.device, worlds: int):
@@ -43,21 +46,21 @@ class Log:
             for name in sums
         ]
         self._belongs = torch.tensor(belongs, device=device)  # [count, cause]
-        self._cut = torch.zeros(worlds, device=device)  # number of a world's episode whose age was written; 0: none
+        self.cut = torch.zeros(worlds, device=device)
 
     def clear(self) -> None:
         """Forget whose ages were written."""
-        self._cut.zero_()
+        self.cut.zero_()
 
     def write_ages(self, memory: torch.Tensor, written: torch.Tensor) -> None:
         """Leave the lengths of the episodes that now go on where ``written`` [world] holds out of the report."""
-        self._cut = torch.where(written, memory[self._episodes][0] + 1.0, self._cut)
+        self.cut.copy_(torch.where(written, memory[self._episodes][0] + 1.0, self.cut))
 
     def __call__(self, memory: torch.Tensor, faults: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the report for the memory [number, world] and what ended worlds [cause, world]."""
         episodes = memory[self._episodes][0]
         finished = (episodes > 0).float()
-        whole = finished * (episodes != self._cut)
+        whole = finished * (episodes != self.cut)
         rows = memory[self._means]  # the last one is of lengths
         means = [*(rows[:-1] @ share(finished)).unbind(), rows[-1] @ share(whole)]
         found = [*means, *(self._belongs @ faults.sum(dim=1)).unbind(), finished.sum(), whole.sum()]

@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
 
+from .commands import HELD
 from .environment import Env
 
 Policy = Callable[[Any], torch.Tensor]
 Read = Callable[[Env], torch.Tensor]
+
+
+@contextlib.contextmanager
+def hold(env: Env, command: Any) -> Iterator[None]:
+    """Hold a command in all worlds, as long as the context lasts; for None do nothing."""
+    if command is None:
+        yield
+        return
+    held, before = env.memory(HELD).clone(), env.command.clone()
+    env.command = torch.tensor(command, dtype=torch.float32, device=env.device)
+    try:
+        yield
+    finally:
+        env.command = torch.where(held > 0.5, before, env.command)
+        env.memory(HELD).copy_(held)
 
 
 def roll(env: Env, policy: Policy, steps: int, read: dict[str, Read], command: Any = None) -> dict[str, torch.Tensor]:
@@ -18,23 +35,22 @@ def roll(env: Env, policy: Policy, steps: int, read: dict[str, Read], command: A
 
     ``valid`` [step, world]: whether the world's first episode still goes on; ``ended`` [world]: whether it has ended by
     a termination, not by its length. Values read after the step that ends an episode belong to the next one.
-    ``command``: held from the first step on; the observation before sees another one.
+    ``command``: held in all observations; None: the environment's own.
     """
-    observed, _ = env.reset()
-    env.episode_length_buf = torch.zeros_like(env.episode_length_buf)
-    alive = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
-    ended = torch.zeros_like(alive)
     found: dict[str, list[torch.Tensor]] = {name: [] for name in ("valid", *read)}
-    for _ in range(steps):
-        if command is not None:
-            env.command[:] = torch.tensor(command, dtype=torch.float32, device=env.device)
-        observed, _, done, extras = env.step(policy(observed))
-        over = done > 0
-        ended |= alive & over & (extras["time_outs"] < 0.5)
-        alive &= ~over
-        found["valid"].append(alive.clone())
-        for name, function in read.items():
-            found[name].append(function(env).clone())
+    with hold(env, command):
+        observed, _ = env.reset()
+        env.episode_length_buf = torch.zeros_like(env.episode_length_buf)
+        alive = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
+        ended = torch.zeros_like(alive)
+        for _ in range(steps):
+            observed, _, done, extras = env.step(policy(observed))
+            over = done > 0
+            ended |= alive & over & (extras["time_outs"] < 0.5)
+            alive &= ~over
+            found["valid"].append(alive.clone())
+            for name, function in read.items():
+                found[name].append(function(env).clone())
     return {name: torch.stack(values) for name, values in found.items()} | {"ended": ended}
 
 

@@ -12,6 +12,7 @@ from ..scene.terrain import Tiles
 from ..trace.functions import where
 from .actions import actuator_labels
 from .compile.vectors import between, find, multiply, vector
+from .drawn_values import WHOLE, as_rows, check_draws
 from .validation import Range, check_interval, check_number, check_span, check_steps
 from .world import World
 
@@ -233,6 +234,10 @@ def randomise(
             that they are in), of joints for values of joints, of actuators for values of actuators; None: all.
         when: see :class:`Values`.
         alike: all entries get the same draw.
+
+    Raises:
+        ValueError: an argument is invalid; or, when the environment is made, a draw may be what the value cannot be,
+            such as a mass of zero.
     """
     if how not in ("scale", "add", "set"):
         raise ValueError(f"events.randomise: how is {how!r}; expected 'scale', 'add' or 'set'")
@@ -245,10 +250,11 @@ def randomise(
 
     def change(w: World) -> None:
         array = w.values[name]
-        rows = array.reshape(1, -1) if name == "gravity" else array.reshape(len(array), -1)
+        rows = as_rows(name, array)
         if len(spans) not in (1, rows.shape[1]):
             raise ValueError(f"events.randomise: {name} has {rows.shape[1]} numbers an entry; span has {len(spans)}")
-        entries = [0] if name == "gravity" else entries_of(w.scene, name, names)
+        entries = entries_of(w.scene, name, names)
+        check_draws(w.scene, name, entries, spans, how)
         draws: list[Any] = []
         for i, entry in enumerate(entries):
             if i == 0 or not alike:
@@ -318,7 +324,7 @@ def servo_gains(
         when: see :class:`Values`.
     """
     for name, factors in (("stiffness", stiffness), ("damping", damping)):
-        check_span("events.servo_gains", name, factors)
+        check_span("events.servo_gains", name, factors, 0.0)
 
     def change(w: World) -> None:
         gain, bias = w.values["actuator_gain"], w.values["actuator_bias"]
@@ -362,6 +368,8 @@ def encoder_bias(size: float = 0.015, names: Any = None) -> EncoderBias:
 
 def entries_of(scene: Any, name: str, names: Any) -> list[int]:
     """Return the entries of a value that regular expressions name; None: all."""
+    if name in WHOLE:
+        return [0]
     family = name.split("_")[0]
     if family == "contact":
         pairs = [{pair.body, pair.other} for pair in scene.contact_pairs]
@@ -384,7 +392,11 @@ def entries_of(scene: Any, name: str, names: Any) -> list[int]:
         hinges = find("events.randomise", "joint", scene.joint_labels, names)
         return [i for hinge in hinges for i in range(int(start[hinge]), int(start[hinge + 1]))]
     labels = scene.body_labels if family == "body" else actuator_labels(scene)
-    return list(range(len(labels))) if names is None else find("events.randomise", family, labels, names)
+    entries = list(range(len(labels))) if names is None else find("events.randomise", family, labels, names)
+    if name == "actuator_gear":  # of each hinge of each actuator
+        starts = np.cumsum([0, *(len(each.hinges) for each in scene.actuators)])
+        return [i for entry in entries for i in range(starts[entry], starts[entry + 1])]
+    return entries
 
 
 def changed_values(scene: Any, events: Sequence[Any]) -> tuple[str, ...]:

@@ -47,7 +47,7 @@ def most(values: list[Any]) -> Any:
 
 
 class FootTimes:
-    """The memory of ``Feet``: air, contact and last air time of each body, brought up to date once in a step."""
+    """The memory of ``Feet``: air, contact and last air time of each body, in steps, brought up to date in each."""
 
     def __init__(self, points: list[list[int]], threshold: float):
         self.points, self.threshold = points, threshold
@@ -64,9 +64,8 @@ class FootTimes:
         kept: list[Any] = []
         for i, touches in enumerate(self.touches(w)):
             air, contact, last = before[i], before[count + i], before[2 * count + i]
-            longer = air + w.dt
-            lands = touches & (contact <= 0.0)
-            kept.append((where(touches, 0.0, longer), where(touches, contact + w.dt, 0.0), where(lands, air, last)))
+            lands = touches & (contact < 0.5)
+            kept.append((where(touches, 0.0, air + 1.0), where(touches, contact + 1.0, 0.0), where(lands, air, last)))
         w.keep(name, [times[k] for k in range(3) for times in kept])
 
 
@@ -75,17 +74,17 @@ def feet(w: World, bodies: Any, threshold: float) -> Feet:
     points = w.points(bodies)
     if not all(points):
         raise ValueError(f"World.feet: some of the bodies {bodies!r} have no contact points; expected bodies that do")
-    name, count = f"feet {bodies} {threshold}", len(points)
+    name, count = f"feet {bodies!r} {threshold!r}", len(points)
     times = FootTimes(points, threshold)
     kept = w.sensor(name, 3 * count, lambda world: times.update(world, name))
-    contact_time = kept[count : 2 * count]
+    air, contact, last = (kept[k * count : (k + 1) * count] for k in range(3))
     return Feet(
         [sum(w.contact_force[i] for i in each) for each in points],
         times.touches(w),
-        kept[:count],
-        contact_time,
-        kept[2 * count :],
-        [(t > 0.0) & (t < 1.5 * w.dt) for t in contact_time],
+        air * w.dt,
+        contact * w.dt,
+        last * w.dt,
+        [(steps > 0.5) & (steps < 1.5) for steps in contact],
         [least([w.contact_gap[i] for i in each]) for each in points],
         [most([w.contact_slip[i] for i in each]) for each in points],
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..scene.ground import HeightField, Plane
 from ..trace.functions import where
-from .compile.vectors import rotate, rotate_back, vector
+from .compile.vectors import as_scalar, rotate, rotate_back, vector
 from .observations import Each
 from .world import World
 
@@ -113,7 +113,9 @@ def cast(w: World, origin: Any, direction: Any, most: float, obstacles: Sequence
     ground = w.scene.ground
     if isinstance(ground, Plane):
         normal = np.array(ground.normal)
-        gap, closing = dot(origin, normal) - ground.height, -dot(direction, normal)
+        moved = w.value("ground_origin")
+        place = vector(x - as_scalar(o) for x, o in zip(origin, moved, strict=True)) if len(moved) else origin
+        gap, closing = dot(place, normal) - ground.height, -dot(direction, normal)
         t = gap / where(closing > SMALLEST, closing, SMALLEST)
         best = where((closing > SMALLEST) & (t < most), where(t > 0.0, t, 0.0), most)
     elif isinstance(ground, HeightField):

@@ -14,6 +14,7 @@ from ..scene.scene import Scene
 from ..viewing import films, shapes
 from . import robots
 from .environment import Env
+from .evaluation import hold
 
 STRIP = 10  # pictures of a strip
 STEPS_A_PICTURE = 2  # of a film
@@ -38,16 +39,15 @@ class Rollout(NamedTuple):
 
 def record(env: Env, policy: Any, seconds: float, command: Any = None, world: int = 0) -> Rollout:
     """Start all worlds anew and return the course of one of them; ``command`` is held if it is given."""
-    observed, _ = env.reset()
-    env.episode_length_buf = torch.zeros_like(env.episode_length_buf)
     commanded = env.has_commands
     states: list[list[np.ndarray]] = [[], [], []]
-    for _ in range(round(seconds / env.step_dt)):
-        if command is not None:
-            env.command[:] = torch.tensor(command, dtype=torch.float32, device=env.device)
-        observed, _, _, _ = env.step(policy(observed))
-        for rows, values in zip(states, (env.q, env.qd, env.command if commanded else env.q), strict=True):
-            rows.append(values[world].cpu().numpy().copy())
+    with hold(env, command):
+        observed, _ = env.reset()
+        env.episode_length_buf = torch.zeros_like(env.episode_length_buf)
+        for _ in range(round(seconds / env.step_dt)):
+            observed, _, _, _ = env.step(policy(observed))
+            for rows, values in zip(states, (env.q, env.qd, env.command if commanded else env.q), strict=True):
+                rows.append(values[world].cpu().numpy().copy())
     q, qd, commands = (np.array(rows) for rows in states)
     return Rollout(q, qd, commands if commanded else None, env.step_dt, env.scene.ground, env.warp_device)
 

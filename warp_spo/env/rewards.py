@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from ..trace.functions import Condition, where
+from ..trace.functions import AbstractScalar, Condition, where
+from .compile.vectors import as_scalar
 from .world import World
 
 Term = Callable[[World], Any]
+UNLIMITED = 1e6  # half of a range of joints [rad or m] from which on it is none
 
 
 def square(values: Any) -> Any:
@@ -115,14 +117,18 @@ def stepping(bodies: Any, height: float = 0.05, longest: float = 0.4) -> Term:
     episode all count.
     """
 
-    def term(w: World) -> Any:
+    def update(w: World, name: str) -> None:
         feet = w.feet(bodies)
-        count, name = len(feet.gap), f"stepping {bodies} {height}"
-        before = w.memory(name, 2 * count)
-        down = [where(touches, 0.0, time + w.dt) for touches, time in zip(feet.touches, before[:count], strict=True)]
-        up = [where(gap > height, 0.0, time + w.dt) for gap, time in zip(feet.gap, before[count:], strict=True)]
+        count = len(feet.gap)
+        before = w.memory(name, 2 * count)  # steps since each foot touched, and since it was high
+        down = [where(touches, 0.0, age + 1.0) for touches, age in zip(feet.touches, before[:count], strict=True)]
+        up = [where(gap > height, 0.0, age + 1.0) for gap, age in zip(feet.gap, before[count:], strict=True)]
         w.keep(name, [*down, *up])
-        steps = [(low < longest) & (high < longest) for low, high in zip(down, up, strict=True)]
+
+    def term(w: World) -> Any:
+        count, name, most = len(w.feet(bodies).gap), f"stepping {bodies!r} {height!r}", w.whole_steps(longest)
+        ages = w.sensor(name, 2 * count, lambda world: update(world, name))
+        steps = [(low < most) & (high < most) for low, high in zip(ages[:count], ages[count:], strict=True)]
         return sum(where(each, 1.0, 0.0) for each in steps) * (1.0 / count)
 
     return term
@@ -176,13 +182,13 @@ def joint_limits(share: float = 0.9, names: Any = None) -> Term:
 
     def term(w: World) -> Any:
         total: Any = 0.0
-        low, high = (w.scene.values[f"joint_limit_{end}"][0] for end in ("lower", "upper"))
+        low, high = (w.value(f"joint_limit_{end}") for end in ("lower", "upper"))
         for hinge, q in zip(w.joints(names), w.joint_q(names), strict=True):
             dof = int(w.scene.qd_start[hinge])
             middle, half = 0.5 * (low[dof] + high[dof]), 0.5 * (high[dof] - low[dof])
-            if half < 1e6:
-                beyond = abs(q - float(middle)) - float(share * half)
-                total = total + where(beyond > 0.0, beyond, 0.0)
+            if isinstance(half, AbstractScalar) or half < UNLIMITED:
+                beyond = abs(q - as_scalar(middle)) - as_scalar(share * half)
+                total = total + where((beyond > 0.0) & (half < UNLIMITED), beyond, 0.0)
         return total
 
     return term

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from .drawn_values import check_drawn
 from .validation import check_whole
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ def begin(env: Env, seed: Any) -> None:
     env._steps = 0
     _write(env, *words)
     env._launch("start")
+    check_drawn(env.scene, env.values)
     env._set_values()
 
 

@@ -14,7 +14,7 @@ Term = Callable[[World], Any]
 
 
 def tilted(angle: float) -> Term:
-    """Return the term that ends an episode where the base's vertical axis leans by more than ``angle`` [rad]."""
+    """Return the term that ends an episode where the base's z axis leans from gravity by more than ``angle`` [rad]."""
     return lambda w: w.projected_gravity[2] > -float(np.cos(angle))
 
 

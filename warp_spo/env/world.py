@@ -15,6 +15,7 @@ from ..trace import spatial
 from ..trace.functions import AbstractScalar, clip, where
 from ..trace.scalars import floor, lookup
 from .compile.fused_kernel import FusedKernel
+from .compile.memory_layout import LEFT_OUT
 from .compile.vectors import Vector, as_scalar, as_value, cross, find, rotate, rotate_back, vector
 from .feet import Feet, feet
 
@@ -57,9 +58,10 @@ class World:
         q, qd: coordinates [coordinate] and velocities [dof]; events assign to their entries.
         action, last_action, action_before: actions of this step, of the step before, and of the one before that.
         contact_force: [point, 3], inertial axes, mean over substeps [N]. contact_gap: [point] distance from the ground
-            [m]. contact_slip: [point], speed along the ground [m/s]. Points are those of ``scene.contact_points``, and
-            after them ``scene.contact_pairs``, each as one: the force is on the first body, the gap infinite where the
-            two share no point.
+            [m], where the last substep began. contact_slip: [point], speed along the ground [m/s]. Points are those of
+            ``scene.contact_points``, and after them ``scene.contact_pairs``, each as one: the force is on the first
+            body, the gap infinite where the two share no point. In the first observation of an episode gaps and slips
+            are those of its state; there is no force, and pairs do not slip.
         time: since the last reset [s].
         dt: of a step of the environment [s].
         values: in events that change values: arrays by name, of abstract scalars or numbers, whose entries they assign.
@@ -74,6 +76,8 @@ class World:
         self.kept: dict[str, Vector] = {}
         self.measured: dict[str, list[Vector]] = {}  # what observations with a history see, the newest first
         self.values: dict[str, np.ndarray] = {}
+        self.present: dict[str, np.ndarray] = {}  # values of the scene that this stage has changed
+        self.lasting = False  # whether what it keeps stays when an episode starts
         self.before: World | None = None
 
     # -- state -----------------------------------------------------------------------------------------------------
@@ -93,6 +97,10 @@ class World:
     @functools.cached_property
     def time(self) -> Any:
         return self.read("episode_length", 1)[0] * self.dt
+
+    def whole_steps(self, seconds: float) -> float:
+        """Return a time [s] in steps of the environment, a number; whole where it is so but for rounding."""
+        return self._layout.whole_steps(seconds)
 
     # -- actions and commands --------------------------------------------------------------------------------------
     @property
@@ -136,7 +144,7 @@ class World:
 
     @functools.cached_property
     def contact_slip(self) -> Vector:
-        return self._quiet(self.read("contact_slip", self._contact_count()))
+        return self.read("contact_slip", self._contact_count())
 
     def points(self, bodies: Any) -> list[list[int]]:
         """Return, for each body whose label matches, the indices of its contact points; numbers."""
@@ -193,8 +201,15 @@ class World:
 
     @property
     def projected_gravity(self) -> Vector:
-        """Unit vector along gravity in the base's axes (3,)."""
-        return rotate_back(self.base_quaternion, np.array([0.0, 0.0, -1.0]))
+        """Unit vector along the world's gravity in the base's axes (3,); without gravity that of -z."""
+        gravity, down = self.value("gravity"), np.array([0.0, 0.0, -1.0])
+        if gravity.dtype != object:
+            size = float(np.linalg.norm(gravity))
+            return rotate_back(self.base_quaternion, gravity / size if size > 0.0 else down)
+        square = sum(x * x for x in gravity)
+        size = np.sqrt(where(square > 0.0, square, 1.0))
+        along = [where(square > 0.0, x / size, z) for x, z in zip(gravity, down, strict=True)]
+        return rotate_back(self.base_quaternion, along)
 
     @property
     def heading(self) -> Any:
@@ -236,6 +251,8 @@ class World:
     @property
     def joint_force(self) -> Vector:
         """Force of actuators, drives and efforts, as actions command, in the state after the step [dof] [N m or N].
+
+        In the first observation of an episode it is that of the action 0 in its state.
 
         Raises:
             ValueError: a drive and an actuator of a joint share its effort limit: how much each gives is not known.
@@ -308,17 +325,15 @@ class World:
 
     def value(self, name: str) -> np.ndarray:
         """Return a value of the scene, such as "body_com" [body, 3]: of this world where it is randomised."""
-        if name in self.values:
-            return self.values[name]
+        if name in self.values or name in self.present:
+            return self.values[name] if name in self.values else self.present[name]
         if name not in self.scene.values:
             raise ValueError(f"World.value: unknown value {name!r}; expected one of {', '.join(self.scene.values)}")
         shape = self.scene.values[name].shape[1:]
         if name not in self._layout.values:
-            if self.scene.values[name].shape[0] > 1:
-                raise ValueError(
-                    f"Env: a term reads {name}, which differs between the scene's worlds; expected a scene of one world"
-                )
-            return self.scene.values[name][0]
+            if self.scene.values[name].shape[0] == 1:
+                return self.scene.values[name][0]
+            self._layout.differing.add(name)
         return self.read(f"value_{name}", int(np.prod(shape))).reshape(shape)
 
     def user(self, term: Any) -> Any:
@@ -343,13 +358,14 @@ class World:
         return low + AbstractScalar(floor((high - low + 1.0) * self._stage.draw()))
 
     # -- memory ----------------------------------------------------------------------------------------------------
-    def memory(self, name: str, size: int, reset: float | None = 0.0) -> Vector:
+    def memory(self, name: str, size: int, reset: Any = LEFT_OUT) -> Vector:
         """Return numbers that this world keeps from step to step [size]; :meth:`keep` changes them.
 
         Args:
             name: of the numbers, the same in all terms that share them.
             size: how many.
             reset: their value at the start of an episode; None: a reset leaves them alone, and they start from zero.
+                Left out: what another term says; None if :class:`events.Start` or :class:`events.Reset` keeps them; 0.
         """
         self._layout.remember(name, size, reset)
         return self.kept[name] if name in self.kept else self.stored_memory(name)
@@ -362,11 +378,11 @@ class World:
     def keep(self, name: str, values: Any) -> None:
         """Set numbers of :meth:`memory`; a reset sets those without a :meth:`memory` call to zero.
 
-        A term that is a reward and an observation, too, does so twice in a step; :meth:`sensor` does so once.
+        What :class:`events.Start` and :class:`events.Reset` keep stays. A term that is a reward and an observation,
+        too, keeps twice in a step; :meth:`sensor` does so once.
         """
         self.kept[name] = vector(values)
-        if name not in self._layout.memory:
-            self._layout.remember(name, len(self.kept[name]), 0.0)
+        self._layout.remember(name, len(self.kept[name]), None if self.lasting else LEFT_OUT)
 
     def sensor(self, name: str, size: int, update: Callable[[World], None], reset: float | None = 0.0) -> Vector:
         """Return numbers of :meth:`memory` that ``update`` keeps once in each step, after the dynamics.

@@ -10,6 +10,10 @@ from ...scene.scene import Scene
 from .guard import Guard
 from .vectors import find
 
+ROUNDING = 1e-9  # share of a time in float64 that is its rounding
+LEFT_OUT: Any = object()
+"""In place of a value at a reset: zero, unless somebody says it."""
+
 
 class MemoryLayout:
     """The arrangement of an environment's arrays.
@@ -23,7 +27,8 @@ class MemoryLayout:
             remember something.
         tables: numbers that all worlds share, by their names in kernels. table_names: names that terms give them.
         weights: of rewards.
-        values: names of the scene's values that differ between worlds.
+        values: names of the scene's values that events change. differing: of those that stages read, and that differ
+            between worlds of the scene itself.
         guard: what ends worlds whose numbers are out of bounds.
         outputs: names under which kernels write results ("reward", a group of observations, ...), by result.
     """
@@ -50,6 +55,8 @@ class MemoryLayout:
         self.biased: list[int] = []
         self.memory: dict[str, tuple[int, int, float | None]] = {}
         self.memory_size = 0
+        self.unsaid: set[str] = set()  # names whose value at a reset nobody has said
+        self.differing: set[str] = set()
         self.frames: list[Any] = []
         self.drawn: dict[str, Any] = {}
         self.observations: dict[Any, int] = {}
@@ -61,18 +68,31 @@ class MemoryLayout:
         self.sensors: dict[str, tuple[int, float | None, Any]] = {}
         self.outputs: dict[str, str] = {}
 
-    def remember(self, name: str, size: int, reset: float | None) -> int:
-        """Return where ``size`` numbers of this name are in the memory."""
+    def remember(self, name: str, size: int, reset: Any = LEFT_OUT) -> int:
+        """Return where ``size`` numbers of this name are in the memory.
+
+        Stages that set what a reset changes are finished when all terms have said what they want.
+        """
         if name not in self.memory:
-            self.memory[name] = self.memory_size, size, reset
+            self.memory[name] = self.memory_size, size, 0.0
             self.memory_size += size
-        start, *known = self.memory[name]
-        if known != [size, reset]:
+            self.unsaid.add(name)
+        start, count, value = self.memory[name]
+        if reset is not LEFT_OUT and name in self.unsaid:
+            self.unsaid.remove(name)
+            self.memory[name] = start, count, value = start, count, reset
+        if size != count or (reset is not LEFT_OUT and reset != value):
+            asked = "" if reset is LEFT_OUT else f", set to {reset}"
             raise ValueError(
-                f"World.memory: {name!r} has {known[0]} numbers, which a reset sets to {known[1]}; a term asks for "
-                f"{size}, set to {reset}; expected the same in all terms"
+                f"World.memory: {name!r} has {count} numbers, which a reset sets to {value}; a term asks for "
+                f"{size}{asked}; expected the same in all terms"
             )
         return start
+
+    def whole_steps(self, seconds: float) -> float:
+        """Return a time in steps of the environment, a whole number where it is one but for rounding."""
+        steps = seconds / self.step_dt
+        return round(steps) if abs(steps - round(steps)) <= ROUNDING * max(1.0, steps) else steps
 
     def output(self, result: str) -> str:
         """Return the name under which kernels write a result: its number, so that no user's name reaches a compiler."""

@@ -7,17 +7,21 @@ worlds alone. final: observations of the state after the step, before new starts
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from ...errors import shown
 from ...trace.functions import AbstractScalar, Condition, where
-from ...trace.scalars import branch
+from ...trace.scalars import branch, floor, ordered
 from ..bounds import term_labels
+from ..commands import COMMAND, HELD
 from ..events import EncoderBias, Interval, Reset, Start, Values
 from ..observations import Observation, name_of
 from ..world import World
+from . import starts
 from .fused_kernel import FusedKernel
 from .guard import BEYOND, LARGEST, NOT_FINITE, Check, first, within
 from .memory_layout import MemoryLayout
@@ -97,9 +101,13 @@ class Tracing:
         self._observe()
         if final:
             self._final()
+        for name, (_, _, update) in [*self.layout.sensors.items()]:
+            if name not in self.judge.kept:
+                update(self.judge)
+                self._hold(self.judge, [name])
+        self._first()
         self._close()
         self._reset()
-        self._first()
 
     # -- act -------------------------------------------------------------------------------------------------------
     def _act(self) -> None:
@@ -164,7 +172,7 @@ class Tracing:
         news = choose(done, [value for _, value in finished], olds, "end")
         for (name, _), value in zip(finished, news, strict=True):
             w.keep(name, [value])
-        self._start(w, done, intervals=True)
+        self.after = self._start(w, done, intervals=True)
 
     def _without(self, w: World, state: list[Check]) -> World:
         """Return the world at the end of its episode, at rest in default_q where its state is out of bounds."""
@@ -184,11 +192,19 @@ class Tracing:
                 pairs = zip(w.stored_memory(name), w.kept[name], strict=True)
                 w.keep(name, [where(self.bad, old, new) for old, new in pairs])
 
-    def _start(self, w: World, done: Condition, intervals: bool) -> None:
-        """Start worlds anew where ``done`` holds; let events happen and draw commands in the others."""
+    def _start(self, w: World, done: Condition, intervals: bool) -> World:
+        """Start worlds anew where ``done`` holds; let events happen and draw commands in the others.
+
+        Returns:
+            The world after the stage: its state, its values, and what it keeps.
+        """
         stage = w._stage
+        later = World(self.layout, stage)
+        later.kept = w.kept
+        self._draw_values(w, done, later, at_reset=True)
         fresh = World(self.layout, stage)
-        fresh.before = self.ended if intervals else None
+        fresh.before, fresh.lasting = self.ended if intervals else None, True
+        fresh.present = dict(later.present)
         fresh.__dict__["q"] = vector(float(x) for x in self.layout.default_q)
         fresh.__dict__["qd"] = vector(0.0 for _ in range(w.scene.dof_count))
         for event in self.events:
@@ -199,20 +215,29 @@ class Tracing:
             name, due = f"until event {number}", done
             left = w.memory(name, 1, reset=None)[0]
             if intervals:
-                left = left - self.layout.step_dt
+                left = left - 1.0
                 changed = World(self.layout, stage)
                 changed.__dict__.update(q=q.copy(), qd=qd.copy())
                 event.change(changed)
-                q, qd = self._merge(w, q, qd, changed, left <= 0.0, f"event {number}")
-                due = done | (left <= 0.0)
-            w.keep(name, choose(due, [w.uniform(*event.seconds)], [left], name))
+                q, qd = self._merge(w, q, qd, changed, left < 0.5, f"event {number}")
+                due = done | (left < 0.5)
+            w.keep(name, choose(due, [self._wait(w, event.seconds)], [left], name))
         q, qd = self._merge(w, q, qd, fresh, done, "start")
         for name, values in (("q", q), ("qd", qd)):
             for i, value in enumerate(values):
                 stage.store(name, i, as_value(value))
-        self._draw_values(w, done, intervals)
+        if intervals:
+            self._draw_values(w, done, later, at_reset=False)
+        later.__dict__.update(q=q, qd=qd)
         if self.commands is not None:
-            self._command(w, done, q, qd, intervals)
+            self._command(w, done, later, intervals)
+        return later
+
+    def _wait(self, w: World, seconds: Any) -> Any:
+        """Return in how many steps something is due that comes after a time drawn in a range [s]: whole, 1 or more."""
+        low, high = (max(1.0, self.layout.whole_steps(end)) for end in seconds)
+        drawn = w.uniform(low, high)
+        return -AbstractScalar(floor(as_value(-drawn)))
 
     def _merge(
         self, w: World, q: Vector, qd: Vector, changed: World, due: Condition, name: str
@@ -231,41 +256,45 @@ class Tracing:
             w.keep(each, values)
         return q, qd
 
-    def _command(self, w: World, done: Condition, q: Vector, qd: Vector, intervals: bool) -> None:
+    def _command(self, w: World, done: Condition, later: World, intervals: bool) -> None:
         left = w.memory("until command", 1, reset=None)[0]
-        due = done | (left <= self.layout.step_dt) if intervals else done
-        passed = self.layout.step_dt if intervals else 0.0
+        due = done | (left < 1.5) if intervals else done
+        passed = 1.0 if intervals else 0.0
         drawn = self.commands.draw(w, done if intervals else None)
         olds = [w.memory(name, len(values), reset=None) for name, values in drawn.items()]
-        news = [*drawn.values(), [w.uniform(*self.commands.seconds)]]
+        news = [*drawn.values(), [self._wait(w, self.commands.seconds)]]
         found = choose(due, np.concatenate(news), np.concatenate([*olds, [left - passed]]), "command")
         for name, values in zip(drawn, np.split(found, np.cumsum([*map(len, olds)])), strict=False):
             w.keep(name, values)
         w.keep("until command", found[-1:])
-        later = World(self.layout, w._stage)
-        later.__dict__.update(q=q, qd=qd)
-        later.kept = w.kept
-        given, updated = w.kept["command"], self.commands.update(later, w.kept["command"])
-        w.keep("command", updated if intervals else [where(done, a, b) for a, b in zip(updated, given, strict=True)])
+        given, updated = w.kept[COMMAND], self.commands.update(later, w.kept[COMMAND])
+        news = updated if intervals else [where(done, a, b) for a, b in zip(updated, given, strict=True)]
+        held, before = w.memory(HELD, len(given), reset=None), w.stored_memory(COMMAND)
+        w.keep(COMMAND, [where(mark > 0.5, old, new) for mark, old, new in zip(held, before, news, strict=True)])
 
     # -- values ----------------------------------------------------------------------------------------------------
-    def _draw_values(self, w: World, done: Condition, intervals: bool) -> None:
-        """Draw values of the scene anew, at resets and from time to time."""
+    def _draw_values(self, w: World, done: Condition, later: World, at_reset: bool) -> None:
+        """Draw values of the scene anew, at resets or from time to time; ``later`` has them."""
         for number, event in enumerate(each for each in self.events if isinstance(each, Values)):
-            if event.when == "reset":
-                self._store_values(w, event, done)
-            elif not isinstance(event.when, str) and intervals:
-                left = w.memory(f"until values {number}", 1, reset=None)[0] - self.layout.step_dt
-                due = left <= 0.0
-                self._store_values(w, event, due)
-                new = w.uniform(*event.when)
-                w.keep(f"until values {number}", choose(due, [new], [left], f"until values {number}"))
+            if event.when == "reset" and at_reset:
+                self._store_values(w, event, done, later)
+            elif not isinstance(event.when, str) and not at_reset:
+                name = f"until values {number}"
+                left = w.memory(name, 1, reset=None)[0] - 1.0
+                due = left < 0.5
+                self._store_values(w, event, due, later)
+                w.keep(name, choose(due, [self._wait(w, event.when)], [left], name))
 
-    def _store_values(self, w: World, event: Values, due: Condition | None) -> None:
-        """Store what an event makes of values where ``due`` holds; None: everywhere."""
+    def _store_values(self, w: World, event: Values, due: Condition | None, later: World | None = None) -> None:
+        """Store what an event makes of values where ``due`` holds; None: everywhere. ``later`` has what is stored."""
         drawn = World(self.layout, w._stage)
         drawn.values = {name: w.scene.values[name][0].astype(object) for name in event.names}
         event.change(drawn)
+        if drawn.kept:
+            raise ValueError(
+                f"events.Values: {event.change} keeps {', '.join(map(shown, drawn.kept))}; expected changes of values "
+                "alone; events.Start and events.Reset may keep numbers"
+            )
         entries: list[tuple[str, int]] = []
         news: Any = []
         for name in event.names:
@@ -278,8 +307,11 @@ class Tracing:
                     news.append(value)
         if due is not None:
             news = choose(due, news, [w._scalar(*entry) for entry in entries], f"values {id(event)}")
-        for entry, value in zip(entries, news, strict=True):
-            w._stage.store(*entry, as_value(value))
+        for (array, i), value in zip(entries, news, strict=True):
+            w._stage.store(array, i, as_value(value))
+            if later is not None:
+                name = array.removeprefix("value_")
+                later.present.setdefault(name, later.value(name).copy()).reshape(-1)[i] = value
 
     def _first(self) -> None:
         """Draw what is drawn once: values of the scene, and memory."""
@@ -289,12 +321,17 @@ class Tracing:
         for event in self.events:
             if isinstance(event, Values):
                 self._store_values(w, event, None)
+            w.lasting = True
             if isinstance(event, Start):
                 event.change(w)
             if isinstance(event, Reset) and event.first is not None:
                 event.first(w)
+            w.lasting = False
         for name, draw in self.layout.drawn.items():
             w.keep(name, draw(w))
+        for number, event in enumerate(each for each in self.events if isinstance(each, Values)):
+            if not isinstance(event.when, str):
+                w.keep(f"until values {number}", [self._wait(w, event.when)])
         for name, values in w.kept.items():
             self._keep(w, name, values)
 
@@ -376,18 +413,36 @@ class Tracing:
             old = self.observed.stored_memory(name)
             due = goes & (self.found < 0.5) if self.layout.memory[name][2] is None else goes
             self._keep(self.observed, name, vector(where(due, a, b) for a, b in zip(values, old, strict=True)))
-        for name, (_, _, update) in self.layout.sensors.items():
-            if name not in self.judge.kept:
-                update(self.judge)
-                self._hold(self.judge, [name])
+        self._store_reports(self.judge, self.done, self.after)
         self._clear(self.judge, self.done)
         self.guard.clear(self.judge, self.done)
+
+    def _store_reports(self, w: World, done: Condition, later: World) -> None:
+        """Store what observations read of a step, as it is in the state in which worlds start where ``done`` holds."""
+        start = World(self.layout, w._stage)
+        start.__dict__.update(q=later.q, qd=later.qd)
+        start.present, start.kept = later.present, dict(w.kept)
+        for name, (_, size, reset) in self.layout.memory.items():
+            if reset is not None:
+                start.kept[name] = vector([reset] * size)
+        found = starts.reports(start, self.actions, self.observed_entries)
+        olds = [w._scalar(*key) for key in found]
+        for key, value in zip(
+            found, choose(done, [*map(AbstractScalar, found.values())], olds, "reports"), strict=True
+        ):
+            w._stage.store(*key, as_value(value))
+
+    @functools.cached_property
+    def observed_entries(self) -> set[tuple[str, int]]:
+        """Entries of arrays that observations read, (array, entry)."""
+        stores = [item.value for stage in self.stages.values() if stage.name == "observe" for item in stage.stores]
+        return {scalar.args for scalar in ordered(stores) if scalar.op == "input"}
 
     def _clear(self, w: World, done: Condition) -> None:
         """Store the memory that a stage keeps; where ``done`` holds, memory with a reset value takes that value."""
         every = list(self.layout.memory.items())
         names = [name for name, (_, _, reset) in every if reset is not None]
-        olds = [w.memory(name, size, reset) for name, (_, size, reset) in every if reset is not None]
+        olds = [w.kept.get(name, w.stored_memory(name)) for name in names]
         resets = [reset for _, size, reset in self.layout.memory.values() if reset is not None for _ in range(size)]
         found = choose(done, resets, [x for values in olds for x in values], "cleared")
         kept = w.kept | dict(zip(names, np.split(found, np.cumsum([*map(len, olds)])), strict=False))
@@ -408,7 +463,8 @@ class Tracing:
         # Two steps of random numbers: one for this stage, one for the observations that follow and count none.
         stage.ticks = f"{CHOSEN_WORLD} ? 2u : 0u"
         w = World(self.layout, stage)
-        self._start(w, chosen, intervals=False)
+        later = self._start(w, chosen, intervals=False)
+        self._store_reports(w, chosen, later)
         stage.store("episode_length", 0, as_value(where(chosen, 0.0, w.read("episode_length", 1)[0])))
         self._clear(w, chosen)
         self.guard.clear(w, chosen)

@@ -66,12 +66,18 @@ def pose(standing: Any, walking: Any, least_command: float = 0.05) -> Any:
 def swing_height(bodies: Any, height: float, least_command: float = 0.05) -> Any:
     """Return the sum over feet that land of (highest gap of the swing / height - 1)^2, while the command moves."""
 
-    def term(w: World) -> Any:
+    def update(w: World, name: str) -> None:
         feet = w.feet(bodies)
-        name = f"highest {bodies}"
-        before = w.memory(name, len(feet.gap))
+        count = len(feet.gap)
+        before = w.memory(name, 2 * count)[:count]
         highest = [where(gap > top, gap, top) for gap, top in zip(feet.gap, before, strict=True)]
-        w.keep(name, [where(touches, 0.0, top) for touches, top in zip(feet.touches, highest, strict=True)])
+        swinging = [where(touches, 0.0, top) for touches, top in zip(feet.touches, highest, strict=True)]
+        w.keep(name, [*swinging, *highest])
+
+    def term(w: World) -> Any:
+        feet, name = w.feet(bodies), f"highest {bodies!r}"
+        count = len(feet.gap)
+        highest = w.sensor(name, 2 * count, lambda world: update(world, name))[count:]
         missed = sum(
             where(lands, (top * (1.0 / height) - 1.0) ** 2, 0.0) for lands, top in zip(feet.lands, highest, strict=True)
         )

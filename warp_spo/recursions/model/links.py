@@ -52,6 +52,7 @@ class Links:
         scene: entries of its values that are the same in all worlds fold; the others are inputs in Newton's names and
             order, ``graph.input("body_mass", body)``.
         variable: names whose entries are inputs, all of them.
+        graph: of the trace; None: a new one.
 
     Attributes:
         scene, variable: as given. graph: the trace's graph.
@@ -65,8 +66,8 @@ class Links:
         flexible: bodies with modes. ports: where children, by body, and frames, by (body, position), of them sit.
     """
 
-    def __init__(self, scene: Scene, variable: tuple[str, ...] = ()):
-        self.scene, self.variable, self.graph = scene, variable, Graph()
+    def __init__(self, scene: Scene, variable: tuple[str, ...] = (), graph: Graph | None = None):
+        self.scene, self.variable, self.graph = scene, variable, Graph() if graph is None else graph
         self.links: list[Link] = []
         self.placements: dict[int, BodyPlacement] = {}
         self.nodes: dict[int, NodeBody] = {}

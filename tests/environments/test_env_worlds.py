@@ -1,0 +1,419 @@
+"""What terms read is what their world is: first observations, memories, periods, held commands, values of the world."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+import warp_spo as spo
+import warp_spo.env as envs
+from support.env_scenes import FEET, cart_env, cart_scene, walker_env, walker_q, walker_scene
+from warp_spo.env import TorchTerm, actions, commands, evaluation, events, observations, rewards
+from warp_spo.env.tasks import velocity
+
+FLOAT32 = 1e-6  # a few roundings of numbers of size one
+STILL = dict(terminations={}, rewards={}, events=[])
+
+
+def first_gaps(env, observed):
+    """Return what is observed of gaps, and those of the dense reference at the environment's state."""
+    wanted = []
+    for q in env.q.double().numpy():
+        poses = spo.Dynamics(env.scene, 1, "cpu", "float64").body_poses(q[None])[0]
+        for point in env.scene.contact_points[:4]:
+            u, w = poses[point.body, 3:6], poses[point.body, 6]
+            v = np.array(point.position)
+            place = poses[point.body, :3] + v + 2.0 * np.cross(u, np.cross(u, v) + w * v)
+            wanted.append(place[2] - point.radius)
+    return observed["a"][:, :4].double().numpy(), np.reshape(wanted, (-1, 4))
+
+
+def test_first_gaps_and_slips_are_those_of_the_new_state():
+    """After construction, resets of all and of some worlds, and at ends of episodes, with velocities at the start."""
+    env = walker_env(
+        4, commands=None, terminations={"low": lambda w: w.q[2] < 0.3}, rewards={},
+        observations={"a": [observations.feet_height(FEET), lambda w: [*w.contact_slip, *w.contact_force.ravel()]]},
+        events=[events.base(z=(0.0, 0.2), roll=(-0.3, 0.3), velocity=(-1.0, 1.0)), events.joints((-0.2, 0.2))],
+    )  # fmt: skip
+
+    def check(observed, worlds):
+        found, wanted = first_gaps(env, observed)
+        np.testing.assert_allclose(found[worlds], wanted[worlds], atol=FLOAT32)
+        speeds = np.linalg.norm(env.qd[worlds, :2].numpy(), axis=1)  # of the belly where nothing turns
+        np.testing.assert_allclose(observed["a"][worlds, 8].numpy(), speeds, rtol=1e-4, atol=1e-4)
+        assert (observed["a"][worlds, 9:] == 0.0).all()
+
+    check(env.get_observations(), [0, 1, 2, 3])
+    for _ in range(3):
+        env.step(torch.randn(4, 8, generator=torch.Generator().manual_seed(1)))
+    check(env.reset()[0], [0, 1, 2, 3])
+    env.step(torch.zeros(4, 8))
+    check(env.reset(torch.tensor([False, True, False, True]))[0], [1, 3])
+    env.q[1, 2] = 0.1
+    observed, _, done, _ = env.step(torch.zeros(4, 8))
+    assert done.tolist() == [0, 1, 0, 0]
+    check(observed, [1])
+
+
+@pytest.mark.parametrize("kind", ["effort", "drive", "servo"])
+def test_first_forces_are_those_of_the_action_zero(kind):
+    """A held push of the episode before is gone; drives and servos pull from the new state to the default."""
+    gains = dict(joint_target_ke=[50.0, 0.0], joint_target_kd=[2.0, 0.0]) if kind == "drive" else {}
+    scene = cart_scene()
+    if kind == "servo":
+        servo = spo.Actuator(0, gain=50.0, bias=(0.0, -50.0, -2.0))
+        scene = spo.Scene(scene.bodies, scene.hinges, actuators=[servo])
+    act = {"effort": actions.Effort("slide", scale=7.0, offset=0.5), "drive": actions.Position("slide", scale=0.3),
+           "servo": actions.Control(scale=0.3, offset="default")}[kind]  # fmt: skip
+    env = cart_env(4, scene=scene.with_values(**gains), actions=act, observations={"a": [lambda w: w.joint_force]})
+
+    def check(observed, worlds):
+        q, qd = (x[worlds, 0].numpy() for x in (env.q, env.qd))
+        wanted = np.full(len(worlds), 0.5) if kind == "effort" else -50.0 * q - 2.0 * qd
+        np.testing.assert_allclose(observed["a"][worlds, 0].numpy(), wanted, atol=1e-4)
+
+    check(env.get_observations(), [0, 1, 2, 3])
+    for _ in range(2):
+        env.step(torch.ones(4, 1))
+    check(env.reset(torch.tensor([True, False, True, False]))[0], [0, 2])
+    env.step(torch.ones(4, 1))
+    env.q[2, 0] = 0.6
+    observed, _, done, _ = env.step(torch.ones(4, 1))
+    assert done.tolist() == [0, 0, 1, 0]
+    check(observed, [2])
+
+
+def test_what_start_and_reset_keep_stays():
+    """Numbers of Start for good, those of Reset until the next one; a curriculum in Reset counts episodes."""
+
+    def change(w):
+        w.keep("level", w.memory("level", 1) + 1.0)
+        w.keep("place", [w.q[0]])
+
+    seen = lambda w: [w.memory(name, 1)[0] for name in ("own", "level", "place")]  # noqa: E731
+    env = cart_env(
+        3, observations={"a": [seen]}, terminations={},
+        events=[events.joints((-0.1, 0.1)), events.Start(lambda w: w.keep("own", [w.uniform(1.0, 2.0)])),
+                events.Reset(change, levels=("level",))],
+    )  # fmt: skip
+    own, place = env.memory("own").clone(), env.q[:, :1].clone()
+    assert (own >= 1.0).all() and own.unique().numel() == 3
+    for step in range(1, 45):
+        observed, *_ = env.step(torch.ones(3, 1))
+        if step % 20 == 0:
+            place = env.q[:, :1].clone()
+        level = torch.full((3, 1), 1.0 + step // 20)
+        assert observed["a"].equal(torch.cat([own, level, place], dim=1)), step
+    assert env.levels()["level"].equal(torch.full((3, 1), 3.0))
+
+
+def test_memories_of_other_sizes_and_of_values_are_refused():
+    """Numbers beyond those of a name would be those of another one."""
+    with pytest.raises(ValueError, match=r"World.memory: 'x' has 1 numbers.*asks for 2"):
+        cart_env(
+            2, rewards={"a": (1.0, lambda w: w.memory("x", 1)[0]), "b": (1.0, lambda w: w.keep("x", [1.0, 2.0]) or 0.0)}
+        )
+    with pytest.raises(
+        ValueError, match=r"World.memory: 'x' has 1 numbers, which a reset sets to 0.0; a term asks for 1, set to None"
+    ):
+        cart_env(
+            2, rewards={"a": (1.0, lambda w: w.memory("x", 1, reset=0.0)[0])},
+            events=[events.Reset(lambda w: w.keep("x", [1.0]))],
+        )  # fmt: skip
+
+    def change(w):
+        w.keep("x", [1.0])
+
+    with pytest.raises(ValueError, match=r"events.Values: .* keeps x; expected changes of values alone"):
+        cart_env(2, events=[events.Values(("body_mass",), change)])
+
+
+def feet_now(env):
+    """Return which feet touch, and their gaps [world, foot]."""
+    return env._tensors["contact_f"][:, :4].norm(dim=2).numpy() > 1.0, env._tensors["contact_gap"][:, :4].numpy().copy()
+
+
+@pytest.mark.slow
+def test_terms_of_one_memory_leave_it_to_each_other():
+    """Twice with other arguments, and twice alike as reward and observation, beside NumPy."""
+    longest, heights = (0.06, 0.16), (0.05, 0.07)
+    terms = [rewards.stepping(FEET, 0.02, longest=each) for each in longest]
+    terms += [velocity.swing_height(FEET, each, least_command=-1.0) for each in heights]
+    seen = {"a": [*terms, terms[0]]}
+    env = walker_env(4, **(STILL | dict(observations=seen, rewards={str(i): (1.0, t) for i, t in enumerate(terms)})))
+    low, high, top, before, landed = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4), bool), 0
+    for step in range(30):
+        observed, reward, *_ = env.step(1.5 * torch.sin(torch.arange(32.0).view(4, 8) + 0.35 * step))
+        touches, gap = feet_now(env)
+        low, high, top = np.where(touches, 0, low + 1), np.where(gap > 0.02, 0, high + 1), np.maximum(gap, top)
+        wanted = [((low < each / 0.02 - 0.5) & (high < each / 0.02 - 0.5)).mean(1) for each in longest]
+        wanted += [np.where(touches & ~before, (top / each - 1.0) ** 2, 0.0).sum(1) for each in heights]
+        np.testing.assert_allclose(observed["a"].numpy(), np.stack([*wanted, wanted[0]], 1), rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(reward.numpy(), 0.02 * np.sum(wanted, axis=0), rtol=1e-4, atol=1e-5)
+        landed += (touches & ~before & (top > 0.01)).sum()
+        top, before = np.where(touches, 0.0, top), touches
+    assert landed > 5
+
+
+def test_names_of_memories_tell_a_text_from_a_tuple():
+    """Expressions that print alike are not the same bodies."""
+    env = walker_env(
+        2,
+        **(
+            STILL
+            | dict(
+                observations={
+                    "a": [lambda w: w.feet("shank0|shank1").air_time, lambda w: w.feet(("shank0|shank1",)).air_time]
+                }
+            )
+        ),
+    )
+    assert {name for name in env._layout.memory if name.startswith("feet")} == {
+        "feet 'shank0|shank1' 1.0",
+        "feet ('shank0|shank1',) 1.0",
+    }
+
+
+@pytest.mark.parametrize(("seconds", "dt"), [
+    (1.0, 0.02), *(pytest.param(seconds, dt, marks=pytest.mark.slow) for seconds, dt in itertools.product(
+        (1.0, 2.0, 3.0, 5.0), (0.02, 0.005, 1.0 / 60.0, 0.1)) if (seconds, dt) != (1.0, 0.02)),
+])  # fmt: skip
+def test_periods_are_whole_steps(dt, seconds):
+    """Pushes, redraws of commands and of values come every ``seconds`` / ``dt`` steps, exactly, again and again."""
+    count = 0
+
+    def change(w):
+        w.keep("pushes", w.memory("pushes", 1, reset=None) + 1.0)
+
+    steps, period = round(seconds / dt), (seconds, seconds)
+    env = cart_env(
+        1, dt=dt, decimation=1, terminations={}, episode_length_s=1e4 * dt,
+        commands=commands.Uniform(((-1.0, 1.0),), period),
+        observations={"a": [lambda w: [w.command[0], w.memory("pushes", 1, reset=None)[0], w.value("body_mass")[0]]]},
+        events=[events.Interval(change, period), events.randomise("body_mass", (0.5, 2.0), when=period)],
+    )  # fmt: skip
+    before, changed = env.get_observations()["a"], []
+    for step in range(1, 2 * steps + 2 if steps <= 100 else steps + 2):
+        observed = env.step(torch.zeros(1, 1))[0]["a"]
+        changed += [(step, *(observed != before)[0].tolist())] * bool((observed != before).any())
+        before, count = observed, count + 1
+    assert changed == [(steps * k, True, True, True) for k in range(1, count // steps + 1)]
+
+
+def test_waits_are_within_their_range_and_of_the_seed():
+    """The first change of a value waits, too, and a reset with a seed repeats all of it."""
+    env = cart_env(
+        64, terminations={}, episode_length_s=10.0, observations={"a": [lambda w: w.value("body_mass")[0]]},
+        events=[events.randomise("body_mass", (0.5, 2.0), when=(0.1, 0.2))],
+    )  # fmt: skip
+    runs = []
+    for _ in range(2):
+        observed = env.reset(seed=3)[0]["a"]
+        runs.append([observed] + [env.step(torch.zeros(64, 1))[0]["a"] for _ in range(30)])
+    assert all(a.equal(b) for a, b in zip(*runs, strict=True))
+    changes = (torch.stack(runs[0])[1:] != torch.stack(runs[0])[:-1])[..., 0].numpy()
+    for world in range(64):
+        at = np.r_[0, 1 + np.flatnonzero(changes[:, world])]
+        assert (np.diff(at) >= 5).all() and (np.diff(at) <= 10).all() and at[1] >= 5, world
+    assert len({int(np.flatnonzero(row)[0]) for row in changes.T}) > 3
+
+
+@pytest.mark.parametrize("asked", [
+    commands.Velocity(heading=(-3.0, 3.0), seconds=(0.04, 0.08), standing=0.5),
+    commands.Velocity(seconds=(0.04, 0.08), standing=0.5),
+], ids=["heading", "redraws"])  # fmt: skip
+def test_a_written_command_is_held(asked):
+    """Through redraws, headings and new episodes; other worlds and other numbers go on as they would."""
+    env, twin = (walker_env(4, commands=asked, terminations={}, episode_length_s=0.3) for _ in range(2))
+    env.command[1] = torch.tensor([0.0, 0.0, 0.0])  # also where the world stands already
+    env.command[2, 2] = 0.3
+    changed = 0
+    for _ in range(40):
+        observed, *_ = env.step(torch.zeros(4, 8))
+        twin.step(torch.zeros(4, 8))
+        assert (env.command[1] == 0.0).all() and env.command[2, 2] == pytest.approx(0.3)
+        assert env.command[[0, 3]].equal(twin.command[[0, 3]]) and env.command[2, :2].equal(twin.command[2, :2])
+        assert observed["actor"][:, 6:9].equal(env.command.clone())
+        changed += int(not twin.command[1].equal(torch.zeros(3)))
+    assert changed > 5
+    env.memory("command held")[:] = 0.0
+    for _ in range(15):
+        env.step(torch.zeros(4, 8))
+    assert env.memory("command held").sum() == 0.0 and (env.command[2, 2] != 0.3 or env.command[1].any())
+    env.command = torch.tensor([0.1, 0.2, 0.3])
+    assert env.memory("command held").all()
+    env.reset(seed=0)
+    assert not env.memory("command held").any()
+
+
+@pytest.mark.slow
+def test_evaluations_hold_their_command():
+    """In every observation of a rollout, the first one included; the environment's own command comes back."""
+    env, seen = walker_env(4, terminations={}), []
+
+    def policy(observed):
+        seen.append(observed["actor"][:, 6:9].clone())
+        return torch.zeros(4, 8)
+
+    evaluation.tracking(env, policy, seconds=0.5, command=(0.3, 0.0, 0.3))
+    assert torch.allclose(torch.stack(seen), torch.tensor([0.3, 0.0, 0.3]))
+    assert not env.memory("command held").any()
+
+
+def test_a_tensor_marks_what_is_written():
+    """Through views, in place, by out=; reading marks nothing, and results are plain tensors."""
+    from warp_spo.env.held_tensor import HeldTensor
+
+    marks = torch.zeros(3, 2)
+    held = HeldTensor.of(torch.zeros(2, 3).t(), marks)
+    for write, wanted in [
+        (lambda: held.__setitem__(1, 5.0), [0, 1, 0]), (lambda: held[:, 0].add_(1.0), [0.5, 0.5, 0.5]),
+        (lambda: held.unbind(0)[2].copy_(torch.ones(2)), [0, 0, 1]),
+        (lambda: torch.add(held, 1.0, out=held), [1, 1, 1]),
+        (lambda: held[torch.tensor([True, False, True])].add_(1.0), [0, 0, 0]),
+        (lambda: held.clone().zero_(), [0, 0, 0]),
+        (lambda: (held * 2.0, held.sum(), held.numpy(), held.equal(marks), held[0].tolist()), [0, 0, 0]),
+    ]:  # fmt: skip
+        marks.zero_()
+        write()
+        assert marks.mean(dim=1).tolist() == wanted
+    assert all(type(x) is torch.Tensor for x in (held + 1.0, held.clone(), torch.stack([held]), held.double()))
+
+
+def test_joint_limits_are_the_worlds():
+    scene = walker_scene(delay=0).with_values(
+        joint_limit_lower=np.r_[[-1e10] * 6, [-1.4] * 7, -1e10], joint_limit_upper=np.r_[[1e10] * 6, [1.0] * 8]
+    )
+    drawn = events.randomise("joint_limit_upper", (0.2, 0.9), names="joint_.*")
+    env = walker_env(6, scene=scene, **(STILL | dict(observations={"a": [rewards.joint_limits(0.5)]}, events=[drawn])))
+    low, high = (
+        env.scene.values["joint_limit_lower"][0, 6:13],
+        env.values["joint_limit_upper"][:, 6:13].double().numpy(),
+    )
+    assert np.ptp(high, axis=0).min() > 0.1
+    beyond = abs(env.q[:, 7:14].double().numpy() - 0.5 * (low + high)) - 0.25 * (high - low)
+    np.testing.assert_allclose(env.get_observations()["a"][:, 0].numpy(), np.maximum(beyond, 0.0).sum(1), rtol=1e-5)
+
+
+@pytest.mark.parametrize("drawn", [False, True], ids=["of the scene", "drawn"])
+def test_gravity_is_the_worlds(drawn):
+    """projected_gravity and tilt along gravity, wherever it points."""
+    scene = walker_scene()
+    scene = spo.Scene(
+        scene.bodies, scene.hinges, gravity=(3.0, -4.0, -5.0), actuators=scene.actuators, contacts=scene.contacts
+    )
+    drawn_values = [events.randomise("gravity", [(-2.0, 2.0)] * 3, "add")] if drawn else []
+    changes = [events.base(yaw=(-3.0, 3.0), roll=(-0.5, 0.5)), *drawn_values]
+    seen = {"a": [observations.projected_gravity, rewards.tilt]}
+    env = walker_env(5, scene=scene, **(STILL | dict(observations=seen, events=changes)))
+    gravity = env.values["gravity"].double().numpy() if drawn else np.tile([3.0, -4.0, -5.0], (5, 1))
+    along = gravity / np.linalg.norm(gravity, axis=1, keepdims=True)
+    u, w = -env.q[:, 3:6].double().numpy(), env.q[:, 6:7].double().numpy()
+    back = along + 2.0 * np.cross(u, np.cross(u, along) + w * along)
+    found = env.get_observations()["a"].double().numpy()
+    np.testing.assert_allclose(found[:, :3], back, atol=FLOAT32)
+    np.testing.assert_allclose(found[:, 3], (back[:, :2] ** 2).sum(1), atol=FLOAT32)
+
+
+def test_gears_and_grounds_are_the_worlds():
+    """Offsets of servos in lengths of the drawn gear, and rays to a plane where the drawn ground is."""
+    from warp_spo.env import rays
+
+    gears = events.randomise("actuator_gear", (0.8, 1.2))
+    moved = events.randomise("ground_origin", [(0.0, 0.0), (0.0, 0.0), (-0.2, 0.2)], "add")
+    down = rays.lidar([(0.0, 0.0, -1.0)])
+    env = walker_env(
+        4,
+        **(
+            STILL
+            | dict(
+                observations={"a": [down, lambda w: w.base_height, lambda w: w.contact_gap[4]]}, events=[gears, moved]
+            )
+        ),
+    )
+    controls = env.controls(torch.zeros(4, 8))["ctrl"].numpy()
+    np.testing.assert_allclose(controls, env.values["actuator_gear"].numpy() * walker_q()[7:], rtol=1e-5)
+    height = walker_q()[2] - env.values["ground_origin"][:, 2:].numpy()
+    assert np.ptp(height) > 0.05
+    np.testing.assert_allclose(env.get_observations()["a"].numpy(), height - [0.0, 0.0, 0.05], atol=1e-5)
+
+
+def test_a_loaded_log_leaves_out_what_the_saved_one_does():
+    env, other = (cart_env(8, terminations={}) for _ in range(2))
+    env.episode_length_buf = torch.tensor([0, *[5] * 7])
+    state = env.state_dict()
+    other.load_state_dict(state)
+    for each in (env, other):
+        for _ in range(20):
+            each.step(torch.zeros(8, 1))
+    assert env.log()["/episode/whole"] == other.log()["/episode/whole"] == 1 and other.log()["/episode/finished"] == 8
+
+
+@pytest.mark.parametrize(("event", "words"), [
+    (events.randomise("body_mass", (0.0, 1.0)),
+     r"body_mass of body trunk would be between 0 and 6.*span \(0.0, 1.0\); expected masses above zero"),
+    (events.randomise("body_mass", (-7.0, 1.0), "add"), "body_mass of body trunk .* between -1 and 7 .*above zero"),
+    (events.randomise("contact_friction", (-0.1, 1.0), "set"), "of contact 0 .* between -0.1 and 1 .*zero or more"),
+    (events.randomise("body_inertia", (-0.5, 1.0)), "of body trunk .* expected positive principal moments"),
+    (events.randomise("body_inertia", (0.1, 0.2), "set"), "of body trunk .* expected positive principal moments"),
+    (events.randomise("joint_damping", (-1.0, 0.5), "add"), "joint_damping of dof base:0 .* between -1 and 0.5"),
+    (events.randomise("actuator_delay", (0, 3), "set"), "of actuator 0 .* expected whole steps; use events.delays"),
+    (events.randomise("actuator_force_range", [(1.0, 2.0), (0.5, 1.5)], "set"), "expected lower ends below upper ends"),
+    (events.randomise("joint_X_p", (-0.1, 0.1), "add"), "joint_X_p of joint base .* expected unit quaternions"),
+    (events.Values(("body_mass",), lambda w: w.values["body_mass"].__setitem__(1, -1.0)),
+     "an event draws body_mass.1. as -1 in world 0"),
+])  # fmt: skip
+def test_impossible_draws_are_refused_with_their_range(event, words):
+    with pytest.raises(ValueError, match=words):
+        walker_env(2, events=[event])
+
+
+def test_terms_in_torch_see_the_new_state():
+    """A TorchTerm among observations, in the first observation after an end."""
+    env = cart_env(4, observations={"a": [TorchTerm(lambda env: env.q, size=2), lambda w: w.q]})
+    env.q[1, 0] = 0.7
+    observed, *_ = env.step(torch.zeros(4, 1))
+    assert observed["a"][:, :2].equal(observed["a"][:, 2:]) and abs(float(observed["a"][1, 0])) < 0.2
+
+
+def test_the_first_gap_of_two_bodies_is_that_of_the_new_state():
+    env = pair_env()
+    q = env.q.numpy()
+    np.testing.assert_allclose(env.get_observations()["a"][:, 0].numpy(), gap_of_spheres(q), atol=FLOAT32)
+    env.step(torch.zeros(3, 1))
+    observed, _ = env.reset(torch.tensor([True, False, True]))
+    np.testing.assert_allclose(observed["a"][[0, 2], 0].numpy(), gap_of_spheres(env.q.numpy())[[0, 2]], atol=FLOAT32)
+
+
+def pair_env():
+    """Two balls of 0.1 m on one rail."""
+    ball = lambda name: spo.Body(1.0, inertia=0.01 * np.eye(3), label=name)  # noqa: E731
+    rail = lambda body: spo.Hinge("prismatic", -1, body, axis=(1, 0, 0), label=f"rail{body}")  # noqa: E731
+    touch = spo.Contact(
+        0, sphere=((0, 0, 0), 0.1), other=spo.Contact(1, sphere=((0, 0, 0), 0.1)), stiffness=1e4, damping=10.0
+    )
+    scene = spo.Scene([ball("a"), ball("b")], [rail(0), rail(1)], contacts=[touch])
+    return cart_env(
+        3, scene=scene, actions=actions.Effort("rail0"), default_q=[0.0, 0.3], rewards={}, terminations={},
+        observations={"a": [lambda w: w.contact_gap]}, events=[events.joints((-0.05, 0.05))],
+    )  # fmt: skip
+
+
+def gap_of_spheres(q):
+    return q[:, 1] - q[:, 0] - 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["go2-flat", "go2-rough", "g1-flat"])
+def test_first_gaps_of_the_tasks_are_those_of_a_step_from_there(task):
+    """The dynamics report the same gaps, to the bit, of a step that starts from the first state."""
+    env = envs.make(task, 8, "cpu", seed=3)
+    report = env.dyn.step_report("contact_gap", like=env.q)
+    state = env.dyn.actuator_state(like=env.q, longest=3) if env._actuator_state is not None else None
+    env.dyn.step(
+        env.q, env.qd, None, 1e-5, report=report, ctrl=torch.zeros(8, len(env.scene.actuators)), actuator_state=state
+    )
+    held = env._tensors["contact_gap"]
+    seen = held.abs().max(dim=0).values > 0
+    assert seen.sum() >= 4 and torch.allclose(held[:, seen], report.contact_gap[:, seen], atol=FLOAT32)

@@ -1,0 +1,107 @@
+"""Checks of values that events draw: what no robot can have is refused, with the range, before a world has it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..errors import shown
+from ..scene.actuators import RANGES
+from ..scene.ground import HEIGHTS
+from ..scene.scene import NOT_NEGATIVE, Scene
+from .validation import Range
+
+SMALLEST = 1e-12  # share of a body's largest moment of inertia that is rounding
+WHOLE = ("gravity", "ground_origin", "ground_field")  # values of the world, which have no entries
+POSES = ("joint_X_p", "joint_X_c")
+QUATERNION = slice(3, 7)  # of a pose's numbers
+
+
+def as_rows(name: str, values: np.ndarray) -> np.ndarray:
+    """Return the numbers of each entry of a value [entry, number]; gravity, and the ground's, are one entry."""
+    return values.reshape(1 if name in WHOLE else len(values), -1)
+
+
+def check_draws(scene: Scene, name: str, entries: Sequence[int], spans: Sequence[Range], how: str) -> None:
+    """Raise ValueError if ``events.randomise`` may draw what a value cannot be.
+
+    Args:
+        name: of the value. entries: that it draws. spans: one for all numbers of an entry, or one each.
+        how: "scale", "add" or "set".
+    """
+    if name == HEIGHTS:
+        raise ValueError(
+            f"events.randomise: all worlds share {name}; expected 'ground_field', which chooses one of a set of fields"
+        )
+    values = scene.values[name][0]
+    rows = as_rows(name, values)
+    rules: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {"scale": np.multiply, "add": np.add}
+    drawn = rules.get(how, lambda row, draw: np.broadcast_to(draw, row.shape))
+    corners = np.array(list(itertools.product(*spans)))
+    for entry in entries:
+        found = np.array([drawn(rows[entry], corner) for corner in np.unique(corners, axis=0)])
+        expected = _complaint(scene, name, rows[entry], found)
+        if expected:
+            low, high = (f"{end:g}" for end in (found.min(), found.max()))
+            asked = ", ".join(map(str, spans))
+            raise ValueError(
+                f"events.randomise: {name} of {_label(scene, name, entry)} would be between {low} and {high} with "
+                f"how={how!r} and span {asked}; expected {expected}"
+            )
+
+
+def check_drawn(scene: Scene, values: Mapping[str, Any]) -> None:
+    """Raise ValueError if what events have drawn [world, ...], by name, holds what a value cannot be."""
+    for name, drawn in values.items():
+        found = drawn.double().cpu().numpy()
+        own = scene.values[name][0]
+        wrong = ~np.isfinite(found) if name not in RANGES else np.isnan(found)
+        wrong |= (found < 0.0) & (name in NOT_NEGATIVE)
+        wrong |= (found <= 0.0) & (own > 0.0) & (name == "body_mass")
+        if wrong.any():
+            world, *place = (int(i[0]) for i in np.nonzero(wrong))
+            more = "above zero" if name == "body_mass" else "zero or more" if name in NOT_NEGATIVE else "finite numbers"
+            span = f"between {found.min():g} and {found.max():g}"
+            raise ValueError(
+                f"Env: an event draws {name}{place} as {found[wrong][0]:g} in world {world}, and all its numbers are "
+                f"{span}; expected {more}; change the ranges of its draws"
+            )
+
+
+def _complaint(scene: Scene, name: str, own: np.ndarray, found: np.ndarray) -> str:
+    """Return what was expected of an entry, ``own`` in the scene and one of ``found`` in a world; "" for nothing."""
+    if name == "body_mass" and (found <= 0.0).any() and (own > 0.0 or (found < 0.0).any()):
+        return "masses above zero"
+    if name == "actuator_delay" and (np.ptp(found) > 0.0 or not (found == np.round(found)).all()):
+        return "whole steps; use events.delays"
+    if name in NOT_NEGATIVE and (found < 0.0).any():
+        return "zero or more"
+    if name == "body_inertia":
+        return "" if _are_inertias(own, found) else "positive principal moments; events.pseudo_inertia keeps them so"
+    if name in RANGES and (found[:, 0] > found[:, 1]).any():
+        return "lower ends below upper ends"
+    if name in POSES and not np.allclose(np.linalg.norm(found[:, QUATERNION], axis=1), 1.0, atol=1e-6):
+        return "unit quaternions; give seven spans, of which the last four leave the quaternion alone"
+    return ""
+
+
+def _are_inertias(own: np.ndarray, found: np.ndarray) -> bool:
+    moments = [np.linalg.eigvalsh(0.5 * (each + np.swapaxes(each, -1, -2)))[..., 0]
+               for each in (own.reshape(3, 3), found.reshape(-1, 3, 3))]  # fmt: skip
+    least = SMALLEST * np.abs(found).max(initial=0.0)
+    return bool((moments[1] > least).all() if moments[0] > least else (moments[1] >= -least).all())
+
+
+def _label(scene: Scene, name: str, entry: int) -> str:
+    """Return the name of an entry of a value in words."""
+    family = name.split("_")[0]
+    labels: Callable[[], Sequence[str]] | None = {
+        "body": lambda: scene.body_labels,
+        "joint": lambda: scene.joint_labels if name in POSES else scene.dof_labels,
+    }.get(family)
+    known = labels() if labels is not None else ()
+    kind = {"joint": "joint" if name in POSES else "dof", "contact": "contact"}.get(family, family)
+    return f"{kind} {shown(known[entry]) if entry < len(known) else entry}"
