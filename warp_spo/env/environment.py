@@ -83,6 +83,7 @@ class Env(VecEnv):
         ValueError, TypeError: an argument is invalid; the message names it.
     """
 
+    @torch.inference_mode(False)  # tensors of inference could not be written outside of it
     def __init__(
         self,
         scene: Scene,
@@ -118,7 +119,7 @@ class Env(VecEnv):
         self.log_interval = check_whole("Env", "log_interval", log_interval, 1)
         self._passes, self.has_commands = arguments.checked_passes(scene, passes), commands is not None
         self.final = arguments.checked_bool("final_observations", final_observations)
-        default = arguments.checked_default(scene, default_q)
+        default, commands = arguments.checked_default(scene, default_q), arguments.checked_commands(commands)
         terms = arguments.checked_terms(observations, rewards, terminations or {}, events)
         self._layout = MemoryLayout(scene, default, self.step_dt, commands, changed_values(scene, events))
         tracing = self._trace(arguments.checked_parts(actions), *terms, commands, events)
@@ -131,8 +132,8 @@ class Env(VecEnv):
         self.values, self._actuator_state = store.values, self._delay_buffers(events)
         self._log = Log(self._layout, self.reward_names, self.termination_names, self.device, worlds)
         self._kernels = self._build(tracing)
-        wanted = self.warp_device.is_cuda if graph is None else bool(graph) and self.warp_device.is_cuda
-        self.replay = Replay(self._parts(), wanted)
+        wanted = graph is None or arguments.checked_bool("graph", graph)
+        self.replay = Replay(self._parts(), wanted and self.warp_device.is_cuda)
         if self.warp_device.is_cuda:
             self._compile()
         self.reset(seed=seed)

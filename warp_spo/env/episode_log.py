@@ -40,7 +40,7 @@ class Log:
 
     def clear(self) -> None:
         """Forget whose ages were written."""
-        self._cut.zero_()
+        self._cut = torch.zeros_like(self._cut)
 
     def write_ages(self, memory: torch.Tensor, written: torch.Tensor) -> None:
         """Leave the lengths of the episodes that now go on where ``written`` [world] holds out of the report."""

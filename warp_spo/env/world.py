@@ -15,6 +15,7 @@ from ..trace import spatial
 from ..trace.functions import AbstractScalar, clip, where
 from ..trace.scalars import floor, lookup
 from .compile.fused_kernel import FusedKernel
+from .compile.returned import numbers
 from .compile.vectors import Vector, as_scalar, as_value, cross, find, rotate, rotate_back, vector
 from .feet import Feet, feet
 
@@ -364,7 +365,8 @@ class World:
 
         A term that is a reward and an observation, too, does so twice in a step; :meth:`sensor` does so once.
         """
-        self.kept[name] = vector(values)
+        size = self._layout.memory[name][1] if name in self._layout.memory else None
+        self.kept[name] = numbers(f"World.keep({name!r}) was given", values, size)
         if name not in self._layout.memory:
             self._layout.remember(name, len(self.kept[name]), 0.0)
 

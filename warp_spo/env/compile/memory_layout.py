@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...scene.scene import Scene
+from ..validation import check_number, check_whole
 from .vectors import find
 
 
@@ -50,9 +51,20 @@ class MemoryLayout:
         self.sensors: dict[str, tuple[int, float | None, Any]] = {}
         self.outputs: dict[str, str] = {}
 
+    @property
+    def control_sizes(self) -> dict[str, int]:
+        """How many entries each array has that actions may set."""
+        scene = self.scene
+        return {"ctrl": len(scene.actuators), "tau": scene.dof_count, "target_q": scene.coord_count}
+
     def remember(self, name: str, size: int, reset: float | None) -> int:
         """Return where ``size`` numbers of this name are in the memory."""
         if name not in self.memory:
+            if not isinstance(name, str):
+                raise TypeError(f"World.memory: name is {name!r}; expected a string")
+            check_whole(f"World.memory({name!r})", "size", size, 0)
+            if reset is not None:
+                check_number(f"World.memory({name!r})", "reset", reset)
             self.memory[name] = self.memory_size, size, reset
             self.memory_size += size
         start, *known = self.memory[name]

@@ -19,7 +19,8 @@ from ..observations import Observation, name_of
 from ..world import World
 from .fused_kernel import FusedKernel
 from .memory_layout import MemoryLayout
-from .vectors import Vector, as_condition, as_value, vector
+from .returned import change, commands_drawn, condition, controls, one_number
+from .vectors import Vector, as_value, vector
 
 LARGEST = 1e30  # numbers beyond it count as not finite
 CAUSES = ("action", "state", "reward")  # of ends for numbers that are not finite, the first first
@@ -126,7 +127,7 @@ class Tracing:
         at = 0
         for part in self.actions:
             size = len(part.labels(w.scene))
-            for entry, value in part.trace(w, action[at : at + size]):
+            for entry, value in controls(part, w, action[at : at + size], self.layout.control_sizes):
                 if any(item.array == part.array and item.index == (entry,) for item in stage.stores):
                     raise ValueError(f"Env: two actions set entry {entry} of {part.array}; expected one")
                 stage.store(part.array, entry, as_value(value))
@@ -143,7 +144,7 @@ class Tracing:
         sane = is_finite([*w.q, *w.qd])
         total: Any = 0.0
         for name, (weight, term) in self.rewards.items():
-            value = weight * self.layout.step_dt * scalar(f"reward {name!r}", term(w))
+            value = weight * self.layout.step_dt * one_number(f"reward {name!r} returned", term(w))
             total = total + value
             earned = where(is_finite([value]), value, 0.0)
             w.keep(f"sum reward {name}", w.memory(f"sum reward {name}", 1) + earned)
@@ -151,7 +152,9 @@ class Tracing:
         bad = ~sane | spoilt | ~fine
         self._count(w, "state", ~sane & ~spoilt)
         self._count(w, "reward", sane & ~fine)
-        ends = {name: as_condition(term(w)) for name, term in self.terminations.items()} | {NOT_FINITE: bad}
+        ends = {
+            name: condition(f"termination {name!r} returned", term(w)) for name, term in self.terminations.items()
+        } | {NOT_FINITE: bad}
         terminated = ends[NOT_FINITE]
         for name in self.terminations:
             terminated = terminated | ends[name]
@@ -185,7 +188,7 @@ class Tracing:
         fresh.__dict__["qd"] = vector(0.0 for _ in range(w.scene.dof_count))
         for event in self.events:
             if isinstance(event, Reset):
-                event.change(fresh)
+                change(event, fresh, self.events)
         q, qd = w.q.copy(), w.qd.copy()
         for number, event in enumerate(each for each in self.events if isinstance(each, Interval)):
             name, due = f"until event {number}", done
@@ -194,7 +197,7 @@ class Tracing:
                 left = left - self.layout.step_dt
                 changed = World(self.layout, stage)
                 changed.__dict__.update(q=q.copy(), qd=qd.copy())
-                event.change(changed)
+                change(event, changed, self.events)
                 q, qd = self._merge(w, q, qd, changed, left <= 0.0, f"event {number}")
                 due = done | (left <= 0.0)
             w.keep(name, choose(due, [w.uniform(*event.seconds)], [left], name))
@@ -223,9 +226,9 @@ class Tracing:
         left = w.memory("until command", 1, reset=None)[0]
         due = done | (left <= self.layout.step_dt) if intervals else done
         passed = self.layout.step_dt if intervals else 0.0
-        drawn = self.commands.draw(w, done if intervals else None)
+        drawn = commands_drawn(self.commands, w, done if intervals else None)
         olds = [w.memory(name, len(values), reset=None) for name, values in drawn.items()]
-        news = [*drawn.values(), [w.uniform(*self.commands.seconds)]]
+        news: list[Any] = [*drawn.values(), [w.uniform(*self.commands.seconds)]]
         found = choose(due, np.concatenate(news), np.concatenate([*olds, [left - passed]]), "command")
         for name, values in zip(drawn, np.split(found, np.cumsum([*map(len, olds)])), strict=False):
             w.keep(name, values)
@@ -253,7 +256,7 @@ class Tracing:
         """Store what an event makes of values where ``due`` holds; None: everywhere."""
         drawn = World(self.layout, w._stage)
         drawn.values = {name: w.scene.values[name][0].astype(object) for name in event.names}
-        event.change(drawn)
+        change(event, drawn, self.events)
         entries: list[tuple[str, int]] = []
         news: Any = []
         for name in event.names:
@@ -312,8 +315,8 @@ class Tracing:
         of_rows: dict[int, World] = {}
         for group, terms in self.groups.items():
             name, at, starts = self.layout.output(kind + group), 0, [0]
-            for term in terms:
-                rows = term.rows
+            for i, term in enumerate(terms):
+                rows, what = term.rows, f"observations[{group!r}][{i}] ({name_of(term)})"
                 if rows:
                     self.apart.add(kind + group)
                     if rows not in of_rows:
@@ -322,13 +325,15 @@ class Tracing:
                         of_rows[rows] = begin(stage)
                     one, stage = of_rows[rows], of_rows[rows]._stage
                     for number in range(stage.at_once):
-                        stage.store_row(name, at, number, as_value(term.trace_row(one, number)))
+                        stage.store_row(name, at, number, as_value(term.trace_row(one, number, what)))
                     at += rows
                 else:
-                    for value in term.trace(w):
+                    for value in term.trace(w, what):
                         w._stage.store(name, at, as_value(value))
                         at += 1
                 starts.append(at)
+            if not at:
+                raise ValueError(f"Env: the terms of observations[{group!r}] returned no numbers; expected one or more")
             self.group_sizes[group], self.term_sizes[group] = at, np.diff(starts).tolist()
 
     # -- memory ----------------------------------------------------------------------------------------------------
@@ -383,18 +388,3 @@ def choose(due: Condition, news: Any, olds: Any, name: str) -> Vector:
     """
     pairs = [(as_value(a), as_value(b)) for a, b in zip(news, olds, strict=True)]
     return vector(AbstractScalar(branch(due.value, a, b, name)) for a, b in pairs)
-
-
-def scalar(what: str, x: Any) -> Any:
-    """Return ``x``, the result of a term, as one number; a condition becomes 1 or 0.
-
-    Raises:
-        TypeError: ``x`` is no number; the message names ``what``.
-    """
-    if isinstance(x, np.ndarray) and x.size == 1:
-        x = x.ravel()[0]
-    if isinstance(x, Condition):
-        return where(x, 1.0, 0.0)
-    if not isinstance(x, AbstractScalar | int | float | np.floating):
-        raise TypeError(f"Env: {what} returned {type(x).__name__}; expected one number")
-    return x
