@@ -182,7 +182,10 @@ def test_reset_of_chosen_worlds():
         (lambda: cart_env().step(torch.zeros(8, 2)), r"actions has shape \(8, 2\); expected \(8, 1\).*slide"),
         (lambda: cart_env().reset(torch.ones(3, dtype=torch.bool)), r"mask is torch.bool \(3,\); expected bool \(8,\)"),
         (lambda: cart_env().reset("all"), r"mask is 'all'; expected bool \(8,\)"),
-        (lambda: cart_env(rewards={"x": (1.0, lambda w: w.q)}), "reward 'x' returned ndarray; expected one number"),
+        (
+            lambda: cart_env(rewards={"x": (1.0, lambda w: w.q)}),
+            "reward 'x' returned an array of shape .2,.; expected one",
+        ),
         (lambda: cart_env(rewards={"x": (1.0, lambda w: w.command[0])}), "reads commands"),
         (lambda: cart_env(rewards={"x": (1.0, lambda w: w.contact_force[0, 0])}), "reads contacts"),
         (lambda: cart_env(rewards={"x": (1.0, lambda w: w.joint_q("knee")[0])}), "'knee' matches no joint"),

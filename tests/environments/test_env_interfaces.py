@@ -66,6 +66,22 @@ def test_gymnasium_checks_one_world():
     check_env(world, skip_render_check=True)
     with pytest.raises(ValueError, match="single=True with 4 worlds"):
         warp_spo.env.gymnasium(cart_env(4), single=True)
+    for given in (dict(tensors=True), dict(autoreset_mode="NextStep")):
+        with pytest.raises(ValueError, match=r"single=True with tensors=.*; expected neither"):
+            warp_spo.env.gymnasium(env, single=True, **given)
+
+
+def test_one_world_waits_for_its_reset():
+    """The step after the end of an episode is an error; logs have plain numbers."""
+    world = warp_spo.env.gymnasium(cart_env(1, final_observations=True, log_interval=5), single=True)
+    world.reset(seed=1)
+    steps = [world.step(world.action_space.sample() * 0.0) for _ in range(20)]
+    assert [late for *_, late, _ in steps] == [False] * 19 + [True] and steps[4][4]["log"]["/not finite/action"] == 0.0
+    with pytest.raises(RuntimeError, match=r"step: the episode has ended; expected reset\(\) before the next step"):
+        world.step(world.action_space.sample())
+    started, _ = world.reset()
+    assert not np.array_equal(started["actor"] if isinstance(started, dict) else started, steps[-1][0])
+    world.step(world.action_space.sample())
 
 
 def test_skrl_trains():

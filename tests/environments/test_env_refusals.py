@@ -1,11 +1,13 @@
 """Errors of environments, by name, and observations of worlds that are not reset."""
 
+import numpy as np
 import pytest
 import torch
 
 import warp_spo as spo
 from support.env_scenes import cart_env
-from warp_spo.env import Observation, TorchTerm, actions, commands, events
+from warp_spo.env import Observation, TorchTerm, actions, commands, events, gymnasium, learning, recording
+from warp_spo.env.observations import Each
 from warp_spo.examples import fourbar
 
 NAN = float("nan")
@@ -29,7 +31,10 @@ ENVIRONMENTS = [
     (dict(observations={"actor": ["q"]}), "Observation: term is 'q'; expected a function"),
     (dict(terminations=[Q]), "terminations is .*expected terms by name"),
     (dict(terminations={"x": None}), r"terminations\['x'\] is None; expected a function"),
-    (dict(terminations={"x": lambda w: w.q[0]}), "a termination returned AbstractScalar; expected a comparison"),
+    (dict(terminations={"x": lambda w: w.q[0]}), "termination 'x' returned a number; expected a comparison"),
+    (dict(actions=[]), r"actions is \[\]; expected one of warp_spo.env.actions, or several"),
+    (dict(commands=3), "commands is 3; expected None, or one of warp_spo.env.commands"),
+    (dict(graph="x"), "graph is 'x'; expected True or False"),
     (dict(terminations={"not finite": lambda w: w.time > 1.0}), "'not finite', which every environment has"),
     (dict(actions=None), "actions holds None; expected those of warp_spo.env.actions"),
     (dict(actions=[actions.Effort("slide"), actions.Effort("slide")]), "two actions set entry 0 of tau"),
@@ -47,11 +52,181 @@ def test_an_environment_names_what_is_wrong(changes, words):
         cart_env(**changes)
 
 
+def returns(value):
+    """Return a term that gives a value, or what a function makes of the world."""
+    return lambda w: value(w) if callable(value) else value
+
+
+def assigns(name, value, entry=None):
+    """Return an event's function that sets ``w.name``, or an entry of it."""
+
+    def change(w):
+        if entry is None:
+            setattr(w, name, value)
+        else:
+            getattr(w, name)[entry] = value
+
+    return change
+
+
+def keeps(name, size, values):
+    def term(w):
+        w.memory(name, size)
+        w.keep(name, values)
+        return 1.0
+
+    return term
+
+
+class Given(commands.Uniform):
+    def draw(self, w, done):
+        return self.ranges
+
+
+class Setting(actions.Effort):
+    def trace(self, w, action):
+        return self.scale
+
+
+MASS = "body_mass"
+SEEN = r"Env: observations\['actor'\]\[1\] \(unnamed\) returned"
+RETURNED = [
+    (dict(observations={"actor": [Q, returns(None)]}), f"{SEEN} None; expected numbers"),
+    (dict(observations={"actor": [Q, returns("x")]}), f"{SEEN} 'x'; expected numbers"),
+    (dict(observations={"actor": [Q, returns([1.0, None])]}), f"{SEEN} a list of 2 that holds None; expected numbers"),
+    (dict(observations={"actor": [Q, returns(NAN)]}), f"{SEEN} nan; expected finite numbers"),
+    (dict(observations={"actor": [Q, returns(torch.ones(2))]}), f"{SEEN} Tensor; .*a term in torch is a TorchTerm"),
+    (dict(observations={"actor": [returns([])]}), r"terms of observations\['actor'\] returned no numbers"),
+    (
+        dict(observations={"actor": [Each(lambda w, row: w.q, [[1.0]] * 20)]}),
+        r"\(lambda row|returned for a row an array",
+    ),
+    (dict(rewards={"up": (1.0, returns(None))}), "Env: reward 'up' returned None; expected one number"),
+    (dict(rewards={"up": (1.0, Q)}), r"reward 'up' returned an array of shape \(2,\); expected one number"),
+    (dict(rewards={"up": (1.0, returns(float("inf")))}), "reward 'up' returned inf; expected one finite number"),
+    (dict(terminations={"out": returns(None)}), "Env: termination 'out' returned None; expected a comparison"),
+    (
+        dict(terminations={"out": returns(np.int64(1))}),
+        r"termination 'out' returned np.int64\(1\); expected a comparison",
+    ),
+    (dict(events=[events.Reset(assigns("q", None, 0))]), r"events\[0\] sets w.q to an array .* holds None; expected 2"),
+    (dict(events=[events.Interval(assigns("qd", [1.0]))]), r"events\[0\] sets w.qd to a list of 1; expected 2 numbers"),
+    (
+        dict(events=[events.Values(MASS, assigns("values", {MASS: [1.0]}))]),
+        r"sets w.values\['body_mass'\] to a list of 1",
+    ),
+    (
+        dict(events=[events.Values(MASS, assigns("values", 1.0, "body_com"))]),
+        r"w.values\['body_com'\]; expected one of",
+    ),
+    (dict(rewards={"up": (1.0, keeps("m", 1, [1.0, 2.0]))}), r"World.keep\('m'\) was given a list of 2; expected one"),
+    (dict(rewards={"up": (1.0, keeps("m", 1, None))}), r"World.keep\('m'\) was given None; expected one number"),
+    (dict(rewards={"up": (1.0, keeps("m", 0.5, 1.0))}), r"World.memory\('m'\): size is 0.5; expected an integer"),
+    (dict(rewards={"up": (1.0, keeps(3, 1, 1.0))}), "World.memory: name is 3; expected a string"),
+    (dict(rewards={"up": (1.0, lambda w: w.memory("m", 1, NAN)[0])}), "reset is nan; expected a finite number"),
+    (dict(commands=Given(((1.0, 2.0),))), "commands.draw returned a tuple of 1; expected vectors by name"),
+    (
+        dict(actions=Setting(scale=[(7, 1.0)])),
+        "actions.Setting.trace: an entry of tau is 7; expected an integer, 0 to 1",
+    ),
+    (dict(actions=Setting(scale=[(0, None)])), "actions.Setting sets entry 0 of tau to None; expected one number"),
+]
+
+
+@pytest.mark.parametrize(("changes", "words"), RETURNED)
+def test_what_came_of_a_function_is_named(changes, words):
+    with pytest.raises((ValueError, TypeError), match=words):
+        cart_env(**changes)
+
+
+def test_comparisons_and_integers_are_numbers_in_observations_and_rewards():
+    """A comparison is 1 or 0; NumPy's integers, nested lists and arrays of one number count as numbers."""
+    seen = [lambda w: w.q[0] > 0.0, lambda w: [w.q[1] > 0.0, np.int64(3)], lambda w: [w.qd, [w.q[0]]]]
+    earned = {"right": (1.0, lambda w: [w.q[0] > 0.0]), "three": (2.0, lambda w: np.int32(3))}
+    env = cart_env(observations={"actor": seen}, rewards=earned, events=[events.joints((-0.1, 0.1))])
+    observed, reward, *_ = env.step(torch.zeros(8, 1))
+    right, three = (env.q > 0.0).float().T, torch.full((8,), 3.0)
+    assert observed["actor"].equal(torch.stack([*right, three, *env.qd.T, env.q[:, 0]], dim=1))
+    assert torch.allclose(reward, env.step_dt * (right[0] + 6.0)) and 0 < right[0].sum() < 8
+
+
+LEARNERS = [
+    (dict(steps=0), "Learner: steps is 0; expected an integer, 1 or more"),
+    (dict(batches=0), "batches is 0"),
+    (dict(epochs=0), "epochs is 0"),
+    (dict(iterations=-1), "iterations is -1"),
+    (dict(worlds=2.5), "worlds is 2.5"),
+    (dict(steps="24"), "steps is '24'"),
+    (dict(hidden=()), r"hidden is \(\); expected widths of one layer or more"),
+    (dict(hidden=64), "hidden is 64; expected widths"),
+    (dict(hidden=(64, 0)), r"hidden\[1\] is 0; expected an integer, 1 or more"),
+    (dict(rate=0.0), "rate is 0.0; expected a finite number above zero"),
+    (dict(target=NAN), "target is nan; expected a finite number above zero"),
+    (dict(deviation=0.0), "deviation is 0.0; expected a finite number, 0.05 to 2"),
+    (dict(discount=1.1), "discount is 1.1; expected a finite number, 0 to 1"),
+    (dict(trace=-0.1), "trace is -0.1; expected a finite number, 0 to 1"),
+    (dict(entropy="x"), "entropy is 'x'; expected a finite number, 0 or more"),
+    (dict(normalize=1), "normalize is 1; expected True or False"),
+]
+
+
+@pytest.mark.parametrize(("changes", "words"), LEARNERS)
+def test_a_learner_names_what_is_wrong(changes, words):
+    with pytest.raises(ValueError, match=words):
+        learning.Learner(**changes)
+
+
+def test_a_training_names_what_is_wrong(tmp_path):
+    env, short = cart_env(2), learning.Learner(steps=1, batches=4)
+    with pytest.raises(ValueError, match=r"Learner: 2 world\(s\) take steps=1 .* 2 in all, for batches=4; expected"):
+        learning.train(env, short, tmp_path / "few")
+    for given, words in (
+        (dict(save_interval=0), "train: save_interval is 0; expected an integer, 1 or more"),
+        (dict(every=0), "train: every is 0; expected an integer, 1 or more"),
+        (dict(iterations=0), "train: iterations is 0"),
+        (dict(seconds=NAN), "train: seconds is nan; expected a number above zero"),
+        (dict(seed="x"), "train: seed is 'x'"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            learning.train(env, learning.Learner(), tmp_path / "none", **given)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(ValueError, match=r"recording.record: seconds is 0.0; expected a finite number, 0.02 or more"):
+        recording.record(env, None, 0.0)
+    with pytest.raises(ValueError, match=r"recording.film: every is 0; expected an integer, 1 or more"):
+        recording.film(None, None, every=0)
+
+
+def test_an_environment_made_in_inference_mode_works_outside():
+    """And inside: the course is the same to the bit."""
+    drive = lambda env: [env.step(torch.full((8, 1), 0.1))[0]["actor"] for _ in range(3)][-1]  # noqa: E731
+    with torch.inference_mode():
+        env, ages = cart_env(final_observations=True), torch.arange(8)
+        env.episode_length_buf = ages  # its log remembers whose
+        inside = drive(env)
+        worlds = gymnasium(env, autoreset_mode="NextStep")
+        worlds.step(worlds.action_space.sample())
+    env.reset(seed=0)
+    env.episode_length_buf = ages
+    assert drive(env).equal(inside)
+    worlds.reset(seed=3)
+    worlds.step(worlds.action_space.sample())
+    worlds.reset(options={"reset_mask": np.ones(8, bool)})
+    env.q[0] = 0.1
+    env.load_state_dict(env.state_dict())
+
+
 PARTS = [
     (lambda: Observation(Q, noise=-1.0), "Observation: noise is -1.0; expected a finite number, 0 or more"),
     (lambda: Observation(Q, clip=(1.0, -1.0)), r"clip is \(1.0, -1.0\); expected a range \(lowest, highest\)"),
     (lambda: Observation(Q, delay=(3, 2)), r"delay is \(3, 2\); expected steps, 0 or more, or a pair"),
     (lambda: Observation(Q, history=0), "history is 0; expected an integer, 1 or more"),
+    (lambda: Each(3, [[1.0]]), "observations.Each: function is 3; expected a function"),
+    (lambda: Each(Q, np.zeros((0, 1))), r"observations.Each: rows has shape \(0, 1\); expected .* one row or more"),
+    (lambda: events.Reset(None), "events.Reset: change is None; expected a function"),
+    (lambda: events.Interval(3), "events.Interval: change is 3; expected a function"),
+    (lambda: events.Values(MASS, None), "events.Values: change is None; expected a function"),
+    (lambda: events.Values(3, Q), "events.Values: names is 3; expected names"),
+    (lambda: events.Start(None), "events.Start: change is None; expected a function"),
     (lambda: TorchTerm(3), "TorchTerm: function is 3; expected a function"),
     (lambda: TorchTerm(Q, size=0), "TorchTerm: size is 0"),
     (lambda: actions.Position(clip=(1.0, NAN)), r"actions.Position: clip is \(1.0, nan\)"),

@@ -167,7 +167,9 @@ def test_the_reference_imports_numpy_and_itself_alone():
         assert {room for _, room in rooms_imported(path)} <= {"reference"}
 
 
-@pytest.mark.parametrize("name", ["benchmarks", "benchmarks/contact", "benchmarks/table", "tests/support"])
+@pytest.mark.parametrize(
+    "name", ["benchmarks", "benchmarks/contact", "benchmarks/mdp", "benchmarks/table", "tests/support"]
+)
 def test_the_map_of_a_folder_names_every_file(name):
     folder = REPOSITORY / name
     names = {path.stem for path in folder.glob("*.py")} - {"__init__", "__main__"}

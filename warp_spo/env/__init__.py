@@ -79,17 +79,19 @@ def gymnasium(env: Env, tensors: bool = False, single: bool = False, autoreset_m
         env: the environment. With ``final_observations=True`` the information holds "final_obs" in the mode "SameStep";
             other modes need it.
         tensors: whether observations, rewards, ends and information are torch tensors on the environment's device.
-        single: return a ``gymnasium.Env`` of the one world of ``env`` instead, which waits for ``reset``.
+        single: return a ``gymnasium.Env`` of the one world of ``env`` instead, with NumPy arrays. After the end of an
+            episode a step is a RuntimeError until ``reset``. It needs ``final_observations=True``.
         autoreset_mode: a ``gymnasium.vector.AutoresetMode`` or its value. "SameStep": a world starts anew in the step
             that ends its episode. "NextStep": in the step after it, which ignores its action and has reward 0.
             "Disabled": in ``reset(options={"reset_mask": ...})``, before the next step. Episodes are the same in all.
 
     Raises:
-        ValueError: the mode is none, or needs ``final_observations=True``; single=True with several worlds.
+        ValueError: the mode is none, or needs ``final_observations=True``; single=True with several worlds, without
+            ``final_observations=True``, or with ``tensors`` or a mode.
     """
     from .interfaces import make_single, make_vector
 
-    return make_single(env) if single else make_vector(env, tensors, autoreset_mode)
+    return make_single(env, tensors, autoreset_mode) if single else make_vector(env, tensors, autoreset_mode)
 
 
 def skrl(env: Env, observations: str | None = None, states: str | None = None) -> Any:

@@ -107,7 +107,16 @@ def checked_parts(actions: Any) -> list[Any]:
     for part in parts:
         if not hasattr(part, "labels"):
             raise TypeError(f"Env: actions holds {part!r}; expected those of warp_spo.env.actions")
+    if not parts:
+        raise ValueError(f"Env: actions is {actions!r}; expected one of warp_spo.env.actions, or several")
     return parts
+
+
+def checked_commands(commands: Any) -> Any:
+    """Return None, or one of ``warp_spo.env.commands``; TypeError for anything else."""
+    if commands is not None and not all(hasattr(commands, name) for name in ("draw", "update", "size", "seconds")):
+        raise TypeError(f"Env: commands is {commands!r}; expected None, or one of warp_spo.env.commands")
+    return commands
 
 
 def checked_actions(call: str, actions: Any, worlds: int, labels: list[str]) -> torch.Tensor:

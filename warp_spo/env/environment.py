@@ -88,6 +88,7 @@ class Env(VecEnv):
         ValueError, TypeError: an argument is invalid; the message names it.
     """
 
+    @torch.inference_mode(False)  # tensors of inference could not be written outside of it
     def __init__(
         self,
         scene: Scene,
@@ -124,7 +125,7 @@ class Env(VecEnv):
         self.log_interval = check_whole("Env", "log_interval", log_interval, 1)
         self._passes, self.has_commands = arguments.checked_passes(scene, passes), commands is not None
         self.final = arguments.checked_bool("final_observations", final_observations)
-        default = arguments.checked_default(scene, default_q)
+        default, commands = arguments.checked_default(scene, default_q), arguments.checked_commands(commands)
         terms = arguments.checked_terms(observations, rewards, terminations or {}, events)
         self.bounds = arguments.checked_bounds(bounds)
         guard = Guard(self.bounds.limits(scene, self.dt, episode_length_s, list(terms[1]), terms[0]))
@@ -143,8 +144,8 @@ class Env(VecEnv):
         held = (self.q, self.qd, self._tensors["contact_gap"]) if of_pairs else ()
         self._spare = tuple(map(torch.zeros_like, held))
         self._kernels = self._build(tracing)
-        wanted = self.warp_device.is_cuda if graph is None else bool(graph) and self.warp_device.is_cuda
-        self.replay = Replay(self._parts(), wanted)
+        wanted = graph is None or arguments.checked_bool("graph", graph)
+        self.replay = Replay(self._parts(), wanted and self.warp_device.is_cuda)
         if self.warp_device.is_cuda:
             self._compile()
         self.reset(seed=seed)

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import as_names
 from ..scene.terrain import Tiles
 from ..trace.functions import where
 from .actions import actuator_labels
 from .compile.vectors import between, find, multiply, vector
 from .drawn_values import WHOLE, as_rows, check_draws
-from .validation import Range, check_interval, check_number, check_span, check_steps
+from .validation import Range, check_function, check_interval, check_number, check_span, check_steps
 from .world import World
 
 
@@ -32,6 +33,12 @@ class Reset:
     first: Callable[[World], None] | None = None
     levels: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        check_function("events.Reset", "change", self.change)
+        if self.first is not None:
+            check_function("events.Reset", "first", self.first)
+        object.__setattr__(self, "levels", as_names("events.Reset", "levels", self.levels, ("terrain",)))
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Interval:
@@ -46,6 +53,7 @@ class Interval:
     seconds: Range = (1.0, 3.0)
 
     def __post_init__(self) -> None:
+        check_function("events.Interval", "change", self.change)
         check_interval("events.Interval", self.seconds)
 
 
@@ -66,6 +74,8 @@ class Values:
     when: str | Range = "start"
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "names", as_names("events.Values", "names", self.names, ("body_mass",)))
+        check_function("events.Values", "change", self.change)
         if isinstance(self.when, str) and self.when not in ("start", "reset"):
             raise ValueError(f"events.Values: when is {self.when!r}; expected 'start', 'reset' or a range of seconds")
         if not isinstance(self.when, str):
@@ -81,6 +91,9 @@ class Start:
     """
 
     change: Callable[[World], None]
+
+    def __post_init__(self) -> None:
+        check_function("events.Start", "change", self.change)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

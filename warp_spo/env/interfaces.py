@@ -74,11 +74,11 @@ def make_vector(env: Env, tensors: bool = False, autoreset_mode: Any = "SameStep
             mask = None if options is None else options.get("reset_mask")
             if seed is not None or mask is None:
                 env.reset(mask, seed)
-                self._waiting.zero_()
+                self._waiting = torch.zeros_like(self._waiting)
             else:
                 mask = arguments.checked_mask("reset: options['reset_mask']", mask, env.num_envs, env.device)
                 env.reset(mask & ~self._waiting)  # those that wait have started anew
-                self._waiting &= ~mask
+                self._waiting = self._waiting & ~mask
             if not isinstance(seed, list | tuple | np.ndarray):
                 super().reset(seed=None if seed is None else int(seed))
             return _plain(env, self._shown(env.get_observations()), tensors), {}
@@ -146,10 +146,15 @@ def _of_world(found: Any, world: Any) -> Any:
     return {name: x[world] for name, x in found.items()} if isinstance(found, dict) else found[world]
 
 
-def make_single(env: Env) -> Any:
+def make_single(env: Env, tensors: bool = False, autoreset_mode: Any = "SameStep") -> Any:
     """Return a ``gymnasium.Env`` of the one world of ``env``; see :func:`warp_spo.env.gymnasium`."""
     import gymnasium
 
+    if tensors or getattr(autoreset_mode, "value", autoreset_mode) != "SameStep":
+        raise ValueError(
+            f"env.gymnasium: single=True with tensors={tensors!r} and autoreset_mode={autoreset_mode!r}; expected "
+            "neither: one world has NumPy arrays, and waits for reset()"
+        )
     if env.num_envs != 1 or not env.final:
         raise ValueError(
             f"env.gymnasium: single=True with {env.num_envs} worlds and final_observations={env.final}; expected "
@@ -157,7 +162,7 @@ def make_single(env: Env) -> Any:
         )
 
     class SingleWorldEnv(gymnasium.Env):
-        """One world; it stays where its episode ended until it is reset."""
+        """One world; after the end of its episode it waits for ``reset``."""
 
         metadata = {"render_modes": []}  # noqa: RUF012
 
@@ -174,12 +179,19 @@ def make_single(env: Env) -> Any:
             return _of_world(_plain(env, env.get_observations(), False), 0), {}
 
         def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
-            """Take a step."""
+            """Take a step; "log" is in the information now and then.
+
+            Raises:
+                RuntimeError: the episode has ended, and the world waits for :meth:`reset`.
+            """
+            if self._ended:
+                raise RuntimeError("step: the episode has ended; expected reset() before the next step")
             given = torch.as_tensor(np.asarray(action, dtype=np.float32))[None].to(env.device)
             observed, rewards, done, extras = env.step(given)
             late, self._ended = bool(extras["time_outs"][0]), bool(done[0])
             seen = _of_world(_plain(env, extras["final_observations"] if self._ended else observed, False), 0)
-            return seen, float(rewards[0]), self._ended and not late, late, {}
+            log = {name: float(value) for name, value in extras.get("log", {}).items()}
+            return seen, float(rewards[0]), self._ended and not late, late, {"log": log} if log else {}
 
     return SingleWorldEnv()
 

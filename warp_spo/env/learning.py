@@ -27,7 +27,9 @@ from ..errors import as_integer
 from ..runtime.arrays import parse_device
 from .environment import Env
 from .training_log import TimeLimitReached, TrainingLog
-from .validation import check_folder
+from .validation import check_folder, check_number, check_positive, check_whole
+
+DEVIATIONS = (0.05, 2.0)  # range of the deviation of actions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +41,10 @@ class Learner:
         steps: of each world in an iteration. hidden: widths of the layers of actor and critic.
         deviation: of the first actions. discount, trace: gamma and lambda. rate: first learning rate; target: of the
             KL divergence, to which the rate adapts. epochs, batches: of each iteration. entropy: weight of its bonus.
+        normalize: whether observations are normalised by their mean and deviation.
+
+    Raises:
+        ValueError: a setting is none; the message names it.
     """
 
     iterations: int = 300
@@ -55,11 +61,38 @@ class Learner:
     entropy: float = 0.01
     normalize: bool = True
 
+    def __post_init__(self) -> None:
+        for name in ("iterations", "worlds", "steps", "epochs", "batches"):
+            check_whole("Learner", name, getattr(self, name), 1)
+        if not isinstance(self.hidden, tuple | list) or not self.hidden:
+            raise ValueError(
+                f"Learner: hidden is {self.hidden!r}; expected widths of one layer or more, such as (64, 64)"
+            )
+        for i, width in enumerate(self.hidden):
+            check_whole("Learner", f"hidden[{i}]", width, 1)
+        for name in ("rate", "target"):
+            check_positive("Learner", name, getattr(self, name))
+        for name, least, most in (("deviation", *DEVIATIONS), ("discount", 0.0, 1.0), ("trace", 0.0, 1.0)):
+            check_number("Learner", name, getattr(self, name), least, most)
+        check_number("Learner", "entropy", self.entropy, 0.0)
+        if not isinstance(self.normalize, bool):
+            raise ValueError(f"Learner: normalize is {self.normalize!r}; expected True or False")
+
     def settings(self, env: Env, save_interval: int) -> dict[str, Any]:
-        """Return the settings in rsl_rl's words."""
+        """Return the settings in rsl_rl's words.
+
+        Raises:
+            ValueError: an iteration has too few steps of all worlds to be split into batches.
+        """
+        samples = self.steps * env.num_envs
+        if samples < max(2, self.batches):  # the deviation of one advantage is none
+            raise ValueError(
+                f"Learner: {env.num_envs} world(s) take steps={self.steps} in an iteration, {samples} in all, for "
+                f"batches={self.batches}; expected two steps or more, and one for each batch"
+            )
         model = {"class_name": "MLPModel", "hidden_dims": list(self.hidden), "activation": "elu",
                  "obs_normalization": self.normalize}  # fmt: skip
-        distribution = {"class_name": Gaussian, "init_std": self.deviation, "std_range": (0.05, 2.0)}
+        distribution = {"class_name": Gaussian, "init_std": self.deviation, "std_range": DEVIATIONS}
         return {
             "num_steps_per_env": self.steps,
             "save_interval": save_interval,
@@ -174,7 +207,10 @@ def make_runner(
     env: Env, learner: Learner, folder: Path | None = None, save_interval: int = 100, every: int = 10,
     began: float | None = None, seconds: float = math.inf,
 ) -> OnPolicyRunner:  # fmt: skip
-    """Return rsl_rl's runner on an environment, which logs the training in ``folder``."""
+    """Return rsl_rl's runner on an environment, which logs the training in ``folder``; see :func:`train`."""
+    for name, value in (("save_interval", save_interval), ("every", every)):
+        check_whole("train", name, value, 1)
+    check_positive("train", "seconds", seconds, endless=True)
     with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints every layer of both networks
         runner = Runner(env, learner.settings(env, save_interval), None, device=str(env.device))
     began = time.time() if began is None else began
@@ -240,7 +276,9 @@ def prepare(
 ) -> tuple[OnPolicyRunner, int]:  # fmt: skip
     """Return a runner that is ready to train, and how many iterations are left; see :func:`train`."""
     check_folder(folder, resume)
-    torch.manual_seed(seed)
+    if iterations is not None:
+        check_whole("train", "iterations", iterations, 1)
+    torch.manual_seed(check_whole("train", "seed", seed, 0, 2**64 - 1))
     folder = Path(folder)
     runner = make_runner(env, learner, folder, save_interval, every, began, seconds)
     first = load_checkpoint(runner, resume) + 1 if resume is not None else 0
@@ -287,7 +325,8 @@ def train(
         seconds: after which no iteration starts; for one process.
 
     Raises:
-        ValueError: the folder holds another training, the checkpoint is not of this task, or nothing is left to do.
+        ValueError: the folder holds another training, the checkpoint is not of this task, or nothing is left to do; or
+            a number of iterations or seconds is none, or not above zero.
         OSError: there is no such checkpoint, or the folder cannot be made.
     """
     runner, left = prepare(env, learner, folder, iterations, resume, seed, save_interval, every, began, seconds)

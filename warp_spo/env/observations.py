@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import shown
 from ..trace.functions import clip, where
 from .compile.fused_kernel import ROW_NUMBER
+from .compile.returned import numbers, one_number
 from .compile.vectors import Vector, rotate, rotate_back, vector
 from .validation import check_function, check_number, check_optional_span, check_steps, check_whole
 from .world import World
@@ -33,13 +34,18 @@ class Each:
     """
 
     def __init__(self, function: Callable[[World, Any], Any], rows: Any):
-        self.function, self.rows = function, np.asarray(rows, dtype=np.float64)
-        if self.rows.ndim != 2:
-            raise ValueError(f"observations.Each: rows has shape {self.rows.shape}; expected [row, number]")
+        self.function = check_function("observations.Each", "function", function)
+        self.rows = np.asarray(rows, dtype=np.float64)
+        if self.rows.ndim != 2 or not len(self.rows):
+            raise ValueError(
+                f"observations.Each: rows has shape {self.rows.shape}; expected [row, number], one row or more"
+            )
 
     def __call__(self, w: World) -> Vector:
         """Return the numbers of all rows."""
-        return vector(self.function(w, row) for row in self.rows)
+        return vector(
+            one_number("observations.Each: the function returned", self.function(w, row)) for row in self.rows
+        )
 
     def of_own_row(self, w: World, number: int) -> Any:
         """Return the number of a row of the thread, in a stage in which a world has threads for its rows."""
@@ -79,9 +85,14 @@ class Observation:
         check_steps(call, "delay", self.delay)
         check_whole(call, "history", self.history, 1)
 
-    def trace(self, w: World, admit: Callable[[Vector], Vector] = lambda values: values) -> Vector:
-        """Return the numbers; ``admit`` returns of what is measured what may be seen and remembered."""
-        values = vector(np.atleast_1d(np.asarray(self.term(w), dtype=object)).ravel())
+    def trace(
+        self, w: World, what: str = "an observation", admit: Callable[[Vector], Vector] = lambda values: values
+    ) -> Vector:
+        """Return the numbers; ``what`` names the observation in errors.
+
+        ``admit`` returns of what is measured what may be seen and remembered.
+        """
+        values = numbers(f"{what} returned", self.term(w))
         if self.bias > 0.0:
             values = values + w.drawn(
                 f"bias {w.number(self)}", len(values), lambda s: [s.uniform(-self.bias, self.bias) for _ in values]
@@ -115,9 +126,10 @@ class Observation:
         plain = self.bias == 0.0 and self.history == 1 and check_steps("Observation", "delay", self.delay) == (0, 0)
         return len(self.term.rows) if isinstance(self.term, Each) and plain and len(self.term.rows) >= MANY else 0
 
-    def trace_row(self, w: World, number: int) -> Any:
-        """Return the number of a row of the thread."""
-        value = self._measurement(w, self.term.of_own_row(w, number))  # type: ignore[attr-defined]
+    def trace_row(self, w: World, number: int, what: str = "an observation") -> Any:
+        """Return the number of a row of the thread; ``what`` names the observation in errors."""
+        found = one_number(f"{what} returned for a row", self.term.of_own_row(w, number))  # type: ignore[attr-defined]
+        value = self._measurement(w, found)
         if w.kept:
             function = self.term.function  # type: ignore[attr-defined]
             kept = ", ".join(map(shown, w.kept))

@@ -15,6 +15,7 @@ from ..viewing import films, shapes
 from . import robots
 from .environment import Env
 from .evaluation import hold
+from .validation import check_number, check_whole
 
 STRIP = 10  # pictures of a strip
 STEPS_A_PICTURE = 2  # of a film
@@ -38,7 +39,13 @@ class Rollout(NamedTuple):
 
 
 def record(env: Env, policy: Any, seconds: float, command: Any = None, world: int = 0) -> Rollout:
-    """Start all worlds anew and return the course of one of them; ``command`` is held if it is given."""
+    """Start all worlds anew and return the course of one of them; ``command`` is held if it is given.
+
+    Raises:
+        ValueError: the time is shorter than a step, or there is no such world.
+    """
+    check_number("recording.record", "seconds", seconds, env.step_dt)
+    check_whole("recording.record", "world", world, 0, env.num_envs - 1)
     commanded = env.has_commands
     states: list[list[np.ndarray]] = [[], [], []]
     with hold(env, command):
@@ -102,6 +109,7 @@ def markers(task: Any, recorded: Rollout, row: int) -> tuple:
 
 def film(task: Any, recorded: Rollout, every: int = 2) -> list:
     """Return pictures of a recording, one of ``every`` steps."""
+    check_whole("recording.film", "every", every, 1)
     return _pictures(task, recorded, range(0, len(recorded.q), every))
 
 

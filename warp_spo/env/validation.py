@@ -14,11 +14,11 @@ from ..errors import as_integer
 Range = tuple[float, float]
 
 
-def check_number(call: str, name: str, value: Any, least: float = -math.inf) -> float:
-    """Return a finite number; ValueError for anything else, or one below ``least``."""
+def check_number(call: str, name: str, value: Any, least: float = -math.inf, most: float = math.inf) -> float:
+    """Return a finite number; ValueError for anything else, or one below ``least`` or above ``most``."""
     found = _number(value)
-    if found is None or found < least:
-        more = "" if least == -math.inf else f", {least:g} or more"
+    if found is None or not least <= found <= most:
+        more = "" if least == -math.inf else f", {least:g} or more" if most == math.inf else f", {least:g} to {most:g}"
         raise ValueError(f"{call}: {name} is {value!r}; expected a finite number{more}")
     return found
 
@@ -29,6 +29,14 @@ def check_whole(call: str, name: str, value: Any, least: int, most: float = math
     if found is None or not least <= found <= most:
         to = f"{least} or more" if most == math.inf else f"{least} to {most}"
         raise ValueError(f"{call}: {name} is {value!r}; expected an integer, {to}")
+    return found
+
+
+def check_positive(call: str, name: str, value: Any, endless: bool = False) -> float:
+    """Return a number above zero, infinity if it may be ``endless``; ValueError for anything else."""
+    found = math.inf if endless and isinstance(value, float) and value == math.inf else _number(value)
+    if found is None or not found > 0.0:
+        raise ValueError(f"{call}: {name} is {value!r}; expected a {'' if endless else 'finite '}number above zero")
     return found
 
 

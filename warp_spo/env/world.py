@@ -16,6 +16,7 @@ from ..trace.functions import AbstractScalar, clip, where
 from ..trace.scalars import floor, lookup
 from .compile.fused_kernel import FusedKernel
 from .compile.memory_layout import LEFT_OUT
+from .compile.returned import numbers
 from .compile.vectors import Vector, as_scalar, as_value, cross, find, rotate, rotate_back, vector
 from .feet import Feet, feet
 
@@ -381,7 +382,8 @@ class World:
         What :class:`events.Start` and :class:`events.Reset` keep stays. A term that is a reward and an observation,
         too, keeps twice in a step; :meth:`sensor` does so once.
         """
-        self.kept[name] = vector(values)
+        size = self._layout.memory[name][1] if name in self._layout.memory else None
+        self.kept[name] = numbers(f"World.keep({name!r}) was given", values, size)
         self._layout.remember(name, len(self.kept[name]), None if self.lasting else LEFT_OUT)
 
     def sensor(self, name: str, size: int, update: Callable[[World], None], reset: float | None = 0.0) -> Vector:

@@ -114,14 +114,12 @@ class Storage:
         self._add("chosen", self._zeros(worlds, dtype=torch.bool), MASK)
 
     def _add_controls(self, layout: MemoryLayout, read: set[str]) -> None:
-        scene = layout.scene
-        sizes = {"ctrl": len(scene.actuators), "tau": scene.dof_count, "target_q": scene.coord_count}
         for name in sorted(layout.action_arrays):
-            self.controls[name] = self._add(name, self._zeros(self.worlds, sizes[name]))
+            self.controls[name] = self._add(name, self._zeros(self.worlds, layout.control_sizes[name]))
         if "target_q" in self.controls:
             self._firsts["target_q"] = self._firsts["q"]
         if "actuator_force" in read:
-            self._add("actuator_force", self._zeros(self.worlds, scene.dof_count))
+            self._add("actuator_force", self._zeros(self.worlds, layout.scene.dof_count))
 
     def _add_measured(self, layout: MemoryLayout, read: set[str]) -> None:
         """Add what the dynamics write: contacts, frames."""

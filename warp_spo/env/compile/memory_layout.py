@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...scene.scene import Scene
+from ..validation import check_number, check_whole
 from .guard import Guard
 from .vectors import find
 
@@ -68,17 +69,28 @@ class MemoryLayout:
         self.sensors: dict[str, tuple[int, float | None, Any]] = {}
         self.outputs: dict[str, str] = {}
 
+    @property
+    def control_sizes(self) -> dict[str, int]:
+        """How many entries each array has that actions may set."""
+        scene = self.scene
+        return {"ctrl": len(scene.actuators), "tau": scene.dof_count, "target_q": scene.coord_count}
+
     def remember(self, name: str, size: int, reset: Any = LEFT_OUT) -> int:
         """Return where ``size`` numbers of this name are in the memory.
 
         Stages that set what a reset changes are finished when all terms have said what they want.
         """
         if name not in self.memory:
+            if not isinstance(name, str):
+                raise TypeError(f"World.memory: name is {name!r}; expected a string")
+            check_whole(f"World.memory({name!r})", "size", size, 0)
             self.memory[name] = self.memory_size, size, 0.0
             self.memory_size += size
             self.unsaid.add(name)
         start, count, value = self.memory[name]
         if reset is not LEFT_OUT and name in self.unsaid:
+            if reset is not None:
+                check_number(f"World.memory({name!r})", "reset", reset)
             self.unsaid.remove(name)
             self.memory[name] = start, count, value = start, count, reset
         if size != count or (reset is not LEFT_OUT and reset != value):

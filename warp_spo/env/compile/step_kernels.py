@@ -25,7 +25,8 @@ from . import starts
 from .fused_kernel import FusedKernel
 from .guard import BEYOND, LARGEST, NOT_FINITE, Check, first, within
 from .memory_layout import MemoryLayout
-from .vectors import Vector, as_condition, as_value, vector
+from .returned import change, commands_drawn, condition, controls, one_number
+from .vectors import Vector, as_value, vector
 
 CHOSEN_WORLD = "chosen.data[world]"  # C++: the world has just started anew
 
@@ -124,7 +125,7 @@ class Tracing:
         at = 0
         for part in self.actions:
             size = len(part.labels(w.scene))
-            for entry, value in part.trace(w, action[at : at + size]):
+            for entry, value in controls(part, w, action[at : at + size], self.layout.control_sizes):
                 if any(item.array == part.array and item.index == (entry,) for item in stage.stores):
                     raise ValueError(f"Env: two actions set entry {entry} of {part.array}; expected one")
                 stage.store(part.array, entry, as_value(value))
@@ -142,7 +143,7 @@ class Tracing:
         total: Any = 0.0
         earned = {}
         for name, (weight, term) in self.rewards.items():
-            value = weight * self.layout.step_dt * scalar(f"reward {name!r}", term(w))
+            value = weight * self.layout.step_dt * one_number(f"reward {name!r} returned", term(w))
             total = total + value
             checks.append(self.guard.check(f"reward/{name}", [value]))
             earned[name] = value
@@ -151,7 +152,8 @@ class Tracing:
         stage.store("faults", 0, as_value(fault))
         for name, value in earned.items():
             w.keep(f"sum reward {name}", w.memory(f"sum reward {name}", 1) + where(bad, 0.0, value))
-        ends = {name: as_condition(term(w)) for name, term in self.terminations.items()} | self.guard.ends(fault)
+        ends = {name: condition(f"termination {name!r} returned", term(w)) for name, term in self.terminations.items()}
+        ends |= self.guard.ends(fault)
         self.bad, self.ended = bad, self._without(w, state)
         self._hold(w, list(w.kept))
         terminated = bad
@@ -209,7 +211,7 @@ class Tracing:
         fresh.__dict__["qd"] = vector(0.0 for _ in range(w.scene.dof_count))
         for event in self.events:
             if isinstance(event, Reset):
-                event.change(fresh)
+                change(event, fresh, self.events)
         q, qd = w.q.copy(), w.qd.copy()
         for number, event in enumerate(each for each in self.events if isinstance(each, Interval)):
             name, due = f"until event {number}", done
@@ -218,7 +220,7 @@ class Tracing:
                 left = left - 1.0
                 changed = World(self.layout, stage)
                 changed.__dict__.update(q=q.copy(), qd=qd.copy())
-                event.change(changed)
+                change(event, changed, self.events)
                 q, qd = self._merge(w, q, qd, changed, left < 0.5, f"event {number}")
                 due = done | (left < 0.5)
             w.keep(name, choose(due, [self._wait(w, event.seconds)], [left], name))
@@ -260,9 +262,9 @@ class Tracing:
         left = w.memory("until command", 1, reset=None)[0]
         due = done | (left < 1.5) if intervals else done
         passed = 1.0 if intervals else 0.0
-        drawn = self.commands.draw(w, done if intervals else None)
+        drawn = commands_drawn(self.commands, w, done if intervals else None)
         olds = [w.memory(name, len(values), reset=None) for name, values in drawn.items()]
-        news = [*drawn.values(), [self._wait(w, self.commands.seconds)]]
+        news: list[Any] = [*drawn.values(), [self._wait(w, self.commands.seconds)]]
         found = choose(due, np.concatenate(news), np.concatenate([*olds, [left - passed]]), "command")
         for name, values in zip(drawn, np.split(found, np.cumsum([*map(len, olds)])), strict=False):
             w.keep(name, values)
@@ -289,7 +291,7 @@ class Tracing:
         """Store what an event makes of values where ``due`` holds; None: everywhere. ``later`` has what is stored."""
         drawn = World(self.layout, w._stage)
         drawn.values = {name: w.scene.values[name][0].astype(object) for name in event.names}
-        event.change(drawn)
+        change(event, drawn, self.events)
         if drawn.kept:
             raise ValueError(
                 f"events.Values: {event.change} keeps {', '.join(map(shown, drawn.kept))}; expected changes of values "
@@ -365,8 +367,8 @@ class Tracing:
         causes, checks = self._causes(), []  # type: ignore[var-annotated]
         for group, terms in self.groups.items():
             name, at, starts = self.layout.output(kind + group), 0, [0]
-            for (cause, _), term in zip(causes[group], terms, strict=True):
-                rows = term.rows
+            for i, ((cause, _), term) in enumerate(zip(causes[group], terms, strict=True)):
+                rows, what = term.rows, f"observations[{group!r}][{i}] ({name_of(term)})"
                 if rows:
                     self.apart.add(kind + group)
                     if rows not in of_rows:
@@ -377,15 +379,17 @@ class Tracing:
                     goes = self._goes(one) if kind == "" else None
                     for number in range(stage.at_once):
                         found: list[Check] = []
-                        (value,) = self.guard.admit(cause, [term.trace_row(one, number)], found)
+                        (value,) = self.guard.admit(cause, [term.trace_row(one, number, what)], found)
                         stage.store_row(name, at, number, as_value(value))
                         self.guard.leave_row(one, kind, cause, found[0], number, goes)
                     at += rows
                 else:
-                    for value in term.trace(w, lambda values: self.guard.admit(cause, values, checks)):  # noqa: B023
+                    for value in term.trace(w, what, lambda values: self.guard.admit(cause, values, checks)):  # noqa: B023
                         w._stage.store(name, at, as_value(value))
                         at += 1
                 starts.append(at)
+            if not at:
+                raise ValueError(f"Env: the terms of observations[{group!r}] returned no numbers; expected one or more")
             self.group_sizes[group], self.term_sizes[group] = at, np.diff(starts).tolist()
         return self.guard.leave(w, f"{kind}observations", checks, self._goes(w) if kind == "" else None)
 
@@ -477,18 +481,3 @@ def choose(due: Condition, news: Any, olds: Any, name: str) -> Vector:
     """
     pairs = [(as_value(a), as_value(b)) for a, b in zip(news, olds, strict=True)]
     return vector(AbstractScalar(branch(due.value, a, b, name)) for a, b in pairs)
-
-
-def scalar(what: str, x: Any) -> Any:
-    """Return ``x``, the result of a term, as one number; a condition becomes 1 or 0.
-
-    Raises:
-        TypeError: ``x`` is no number; the message names ``what``.
-    """
-    if isinstance(x, np.ndarray) and x.size == 1:
-        x = x.ravel()[0]
-    if isinstance(x, Condition):
-        return where(x, 1.0, 0.0)
-    if not isinstance(x, AbstractScalar | int | float | np.floating):
-        raise TypeError(f"Env: {what} returned {type(x).__name__}; expected one number")
-    return x

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ...errors import shown
-from ...trace.functions import AbstractScalar, Condition, where
-from ...trace.scalars import Value, is_constant
+from ...trace.functions import AbstractScalar, where
+from ...trace.scalars import Value
 
 Vector = np.ndarray  # of abstract scalars
 
@@ -88,15 +88,3 @@ def as_scalar(x: Any) -> Any:
 def as_value(x: Any) -> Value:
     """Return the traced value of an abstract scalar, or a number."""
     return x.value if isinstance(x, AbstractScalar) else float(x)
-
-
-def as_condition(x: Any) -> Condition:
-    """Return what a termination returned as a condition."""
-    if isinstance(x, Condition):
-        return x
-    if isinstance(x, AbstractScalar) and not is_constant(x.value) and x.value.op == "input":
-        if x.value.args[0] == "user":  # of a term in torch
-            return abs(x) > 0.0
-    if isinstance(x, bool | np.bool_):
-        return Condition(1.0 if x else 0.0)
-    raise TypeError(f"Env: a termination returned {type(x).__name__}; expected a comparison, such as w.q[1] > 0.3")

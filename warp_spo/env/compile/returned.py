@@ -1,0 +1,138 @@
+"""Checks of what terms, events, commands and actions return and assign; errors name them."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...errors import shown
+from ...trace.functions import AbstractScalar, Condition, where
+from ...trace.scalars import is_constant
+from ..validation import check_whole
+from .vectors import Vector, vector
+
+if TYPE_CHECKING:
+    from ..world import World
+
+
+def numbers(what: str, values: Any, size: int | None = None) -> Vector:
+    """Return numbers, or one, as a vector of abstract scalars and Python floats; a condition becomes 1 or 0.
+
+    Args:
+        what: the function, and what it gives, in errors: "reward 'up' returned".
+        values: a number, or an array, list or tuple of numbers of any shape. size: how many are expected; None: any.
+
+    Raises:
+        TypeError: one of them is no number, or not finite.
+        ValueError: there are more or fewer than ``size``.
+    """
+    found = vector(_number(what, values, x, size) for x in _flat(values))
+    if size is not None and len(found) != size:
+        raise ValueError(f"Env: {what} {came(values)}; expected {_expected(size)}")
+    return found
+
+
+def one_number(what: str, value: Any) -> Any:
+    """Return one number, or an array of one, as an abstract scalar or a float; errors as :func:`numbers`."""
+    return numbers(what, value, 1)[0]
+
+
+def condition(what: str, value: Any) -> Condition:
+    """Return a comparison, a bool, or the number of a term in torch, as a condition.
+
+    Raises:
+        TypeError: it is something else, such as a number; the message names ``what``.
+    """
+    x = value.ravel()[0] if isinstance(value, np.ndarray) and value.size == 1 else value
+    if isinstance(x, Condition):
+        return x
+    if isinstance(x, AbstractScalar) and not is_constant(x.value) and x.value.op == "input":
+        if x.value.args[0] == "user":  # of a term in torch
+            return abs(x) > 0.0
+    if isinstance(x, bool | np.bool_):
+        return Condition(1.0 if x else 0.0)
+    raise TypeError(f"Env: {what} {came(value)}; expected a comparison, such as w.q[1] > 0.3")
+
+
+def change(event: Any, w: World, events: list) -> None:
+    """Let an event, one of ``events``, change the state or the values of a world.
+
+    Raises:
+        TypeError, ValueError: it assigns no numbers, or not as many as there are; the message names it.
+    """
+    what, values = f"events[{events.index(event)}]", {*w.values}
+    state = {"q": w.scene.coord_count, "qd": w.scene.dof_count}
+    event.change(w)
+    for name in state.keys() & w.__dict__.keys():
+        w.__dict__[name] = numbers(f"{what} sets w.{name} to", w.__dict__[name], state[name])
+    if unknown := sorted({*w.values} - values):
+        raise ValueError(
+            f"Env: {what} sets w.values[{unknown[0]!r}]; expected one of its names, {', '.join(sorted(values))}"
+        )
+    for name in values:
+        own = w.scene.values[name][0]
+        w.values[name] = numbers(f"{what} sets w.values[{name!r}] to", w.values[name], own.size).reshape(own.shape)
+
+
+def commands_drawn(commands: Any, w: World, done: Any) -> dict[str, Vector]:
+    """Return a new command and what belongs to it, by name; errors as :func:`numbers`."""
+    drawn = commands.draw(w, done)
+    if not isinstance(drawn, dict) or "command" not in drawn:
+        raise TypeError(f"Env: commands.draw returned {came(drawn)}; expected vectors by name, 'command' among them")
+    sizes = {"command": commands.size}
+    return {name: numbers(f"commands.draw returned as {name!r}", x, sizes.get(name)) for name, x in drawn.items()}
+
+
+def controls(part: Any, w: World, action: Vector, sizes: dict[str, int]) -> list[tuple[int, Any]]:
+    """Return (entry, number) of what a part of the actions sets in its array, which has so many entries.
+
+    Raises:
+        TypeError, ValueError: it sets no numbers, or an entry that is not there; the message names it.
+    """
+    what, size, found = f"actions.{type(part).__name__}", sizes[part.array], part.trace(w, action)
+    if not isinstance(found, list | tuple) or not all(isinstance(each, tuple) and len(each) == 2 for each in found):
+        raise TypeError(f"Env: {what}.trace returned {came(found)}; expected a list of (entry, number)")
+    for entry, _ in found:
+        check_whole(f"Env: {what}.trace", f"an entry of {part.array}", entry, 0, size - 1)
+    return [(int(entry), one_number(f"{what} sets entry {entry} of {part.array} to", x)) for entry, x in found]
+
+
+def came(value: Any) -> str:
+    """Return what came, in words: the shape of an array, the length of a list, a plain value, or its kind."""
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
+    if isinstance(value, list | tuple):
+        return f"a {type(value).__name__} of {len(value)}"
+    if isinstance(value, AbstractScalar):
+        return "a number"
+    if value is None or isinstance(value, bool | int | float | complex | str | np.generic):
+        return shown(repr(value))
+    return type(value).__name__
+
+
+def _flat(values: Any) -> list[Any]:
+    """Return the entries of arrays, lists and tuples in their order, however deep; anything else as the only entry."""
+    if isinstance(values, np.ndarray | list | tuple):
+        return [x for part in (values.ravel() if isinstance(values, np.ndarray) else values) for x in _flat(part)]
+    return [values]
+
+
+def _expected(size: int | None, kind: str = "") -> str:
+    """Return what was expected in words, such as "2 finite numbers"."""
+    return {None: f"{kind}numbers", 1: f"one {kind}number"}.get(size, f"{size} {kind}numbers")
+
+
+def _number(what: str, values: Any, x: Any, size: int | None) -> Any:
+    """Return an entry of ``values`` as an abstract scalar or a float; TypeError for what is none."""
+    if isinstance(x, Condition):
+        return where(x, 1.0, 0.0)
+    if isinstance(x, AbstractScalar):
+        return x
+    plain = isinstance(x, bool | int | float | np.bool_ | np.integer | np.floating)
+    if plain and math.isfinite(x):
+        return float(x)
+    held = came(x) if x is values else f"{came(values)} that holds {came(x)}"
+    way_out = "; a term in torch is a TorchTerm" if hasattr(x, "detach") else ""
+    raise TypeError(f"Env: {what} {held}; expected {_expected(size, 'finite ' if plain else '')}{way_out}")
