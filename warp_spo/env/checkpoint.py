@@ -66,7 +66,7 @@ def start_at(self: Env, levels: Mapping[str, torch.Tensor]) -> None:
 
 
 def state_dict(self: Env) -> dict[str, torch.Tensor]:
-    """Return copies of all tensors that the next steps depend on, by name.
+    """Return copies of all tensors that the next steps and logs depend on, by name.
 
     ``torch.save`` stores them. An environment that is made with the same arguments goes on from them to the bit, on the
     same device: :meth:`load_state_dict`.
@@ -128,7 +128,8 @@ def _check_tensors(what: str, given: Any) -> None:
 def _tensors(env: Env) -> dict[str, torch.Tensor]:
     """Return the tensors themselves."""
     delays = env._actuator_state or ()
-    return env._store.changing() | {f"actuator state {i}": part for i, part in enumerate(delays)}
+    own = {f"actuator state {i}": part for i, part in enumerate(delays)} | {"cut episodes": env._log.cut}
+    return env._store.changing() | own
 
 
 reduce = never_copied(

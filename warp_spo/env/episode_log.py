@@ -36,21 +36,21 @@ class Log:
             torch.tensor([layout.memory[name][0] for name in names], device=device)
             for names in (means.values(), counts.values(), ["episodes"])
         )
-        self._cut = torch.zeros(worlds, device=device)  # number of a world's episode whose age was written; 0: none
+        self.cut = torch.zeros(worlds, device=device)  # number of a world's episode whose age was written; 0: none
 
     def clear(self) -> None:
         """Forget whose ages were written."""
-        self._cut.zero_()
+        self.cut.zero_()
 
     def write_ages(self, memory: torch.Tensor, written: torch.Tensor) -> None:
         """Leave the lengths of the episodes that now go on where ``written`` [world] holds out of the report."""
-        self._cut = torch.where(written, memory[self._episodes][0] + 1.0, self._cut)
+        self.cut.copy_(torch.where(written, memory[self._episodes][0] + 1.0, self.cut))
 
     def __call__(self, memory: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the report for the memory [number, world]."""
         episodes = memory[self._episodes][0]
         finished = (episodes > 0).float()
-        whole = finished * (episodes != self._cut)
+        whole = finished * (episodes != self.cut)
         rows = memory[self._means]  # the last one is of lengths
         means = [*(rows[:-1] @ share(finished)).unbind(), rows[-1] @ share(whole)]
         found = [*means, *memory[self._counts].sum(dim=1).unbind(), finished.sum(), whole.sum()]
