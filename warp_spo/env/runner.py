@@ -8,7 +8,6 @@ import sys
 import time
 import warnings
 from collections.abc import Mapping
-from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -110,10 +109,9 @@ class Runner(OnPolicyRunner):
 
     # -- inside ----------------------------------------------------------------------------------------------------
     def _networks(self, found: dict[str, Any], infos: dict | None = None) -> dict[str, Any]:
-        versions = {name: metadata.version(name) for name in ("torch", "rsl-rl-lib")} | {"warp_spo": version()}
         return self.alg.save() | {
             "iter": self.current_learning_iteration, "infos": (infos or {}) | found,
-            "format": training_files.FORMAT, "versions": versions,
+            "format": training_files.FORMAT, "versions": training_files.versions(),
         }  # fmt: skip
 
     def _write(self, name: str, contents: Mapping[str, Any], before: Mapping[str, str]) -> None:
@@ -253,14 +251,6 @@ def describe_end(ending: Ending) -> str:
     words += [f"stopped by {ending.fault}"] if ending.fault else []
     words += [f"not written: {', '.join(ending.unwritten)}"] if ending.unwritten else []
     return "; ".join(words)
-
-
-def version() -> str:
-    """Return the version of this package; "source" where it is not installed."""
-    try:
-        return metadata.version("warp_spo")
-    except metadata.PackageNotFoundError:
-        return "source"
 
 
 def _on_host(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:

@@ -9,6 +9,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Mapping
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -117,3 +118,14 @@ def newest(folder: str | Path) -> Path | None:
         if number >= 0:
             break
     return best
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of this package and of those that learn; "source" where it is not installed."""
+    found = {}
+    for name in ("warp_spo", "warp-lang", "torch", "rsl-rl-lib"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "source"
+    return found
