@@ -25,12 +25,12 @@ def main(arguments: list[str] | None = None) -> int:
     """Play the checkpoint that the arguments name."""
     from .command_line import Parser, count, seconds
     from .env.tasks import TASKS, task
-    from .train import load_learning
+    from .train import SET, load_learning
 
     parser = Parser(
         prog="python -m warp_spo.play", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("task", choices=sorted(TASKS))
+    parser.add_argument("task", help=f"{', '.join(TASKS)}, FILE.py, package.module, or a name that a package registers")
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--seconds", type=seconds, default=8.0, help="of the film")
@@ -44,41 +44,60 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--view", action="store_true", help="show Newton's viewer")
     parser.add_argument("--mujoco", action="store_true", help="let 64 robots walk in MuJoCo, on the CPU")
     parser.add_argument("--export", type=Path, help="write NAME.onnx and NAME.pt, TorchScript")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes", help=SET)
+    parser.add_argument("--settings", type=Path, metavar="FILE.toml", help="such settings in a file")
     options = parser.parse_args(arguments)
 
     learning = load_learning(parser)
-    from .env import export, recording
+    from .env import evaluation, export, recording, robots, settings
+    from .env.task_files import build, short_name
     from .viewing import films
 
-    chosen = task(options.task)
+    own = short_name(options.task)
     worlds = options.worlds if options.measure else 1
     name = options.out or options.checkpoint.with_suffix("")
     try:
+        chosen = task(options.task)
         given = checked(options, chosen)
-        env = chosen.build(worlds, learning.pick_device(options.device), seed=options.seed, **given)
+        _, tree = settings.gather(options.checkpoint.parent, own, options.settings, options.changes)
+        of_learner, of_task = settings.split(tree)
+        learner = settings.changed(chosen.LEARNER, of_learner, "learner")
+        env = build(chosen, worlds, learning.pick_device(options.device), options.seed, of_task | given)
         wanted = env.command.shape[1] if env.has_commands else 0
         if options.command is not None and len(options.command) != wanted:
             raise ValueError(f"--command has {len(options.command)} number(s); {options.task} expects {wanted}")
-        runner = learning.make_runner(env, chosen.LEARNER)
+        runner = learning.make_runner(env, learner)
         iteration = learning.load_checkpoint(runner, options.checkpoint, learns=False)
     except (ValueError, OSError, ImportError) as error:
         parser.error(str(error))
     policy = learning.policy_of(runner)
     print(f"{options.checkpoint}: after {iteration + 1} iteration(s)", flush=True)
     if options.measure:
-        print(json.dumps(chosen.measure(env, policy), indent=1))
+        print(json.dumps(getattr(chosen, "measure", evaluation.episodes)(env, policy), indent=1))
     if options.export:
-        for file in export.save(runner, env, options.task, options.export):
+        for file in export.save(runner, env, own, options.export):
             print(file)
     if options.mujoco:
-        print(json.dumps(walk_in_mujoco(runner, env, options.task), indent=1))
+        try:
+            print(json.dumps(walk_in_mujoco(runner, env, own, chosen), indent=1))
+        except (ValueError, OSError) as error:
+            parser.error(str(error))
     if options.film is None and (options.export or options.mujoco) and not options.view:
         return 0  # an export, or a run in MuJoCo, alone
+    suffix = f".{options.film or 'gif'}"
+    if getattr(chosen, "ROBOT", None) not in robots.NAMES or not hasattr(chosen, "CAMERA"):
+        if options.view:
+            recorded = recording.record(env, policy, options.seconds, options.command)
+            recording.show(robot_file(chosen), recorded, env.step_dt)
+        camera = getattr(chosen, "CAMERA", None)
+        for file in recording.play(env, policy, name, options.seconds, options.command, camera, suffix):
+            print(file)
+        return 0
     recorded = recording.record(env, policy, options.seconds, options.command)
     if options.view:
-        recording.show(chosen.ROBOT, recorded, env.step_dt)
+        recording.show(robot_file(chosen), recorded, env.step_dt)
     frames = recording.film(chosen, recorded, recording.STEPS_A_PICTURE)
-    print(films.save(frames, name.with_suffix(f".{options.film or 'gif'}"), recording.STEPS_A_PICTURE * env.step_dt))
+    print(films.save(frames, name.with_suffix(suffix), recording.STEPS_A_PICTURE * env.step_dt))
     strip = recording.strip(chosen, recorded)
     print(films.save_strip(strip, name.with_suffix(".png")))
     return 0
@@ -91,12 +110,18 @@ def checked(options: argparse.Namespace, chosen: Any) -> dict[str, str]:
         ValueError: the task has no such trial, or no velocities to track in MuJoCo. ImportError: a package is missing.
         OSError: the folder cannot be made.
     """
+    from .env.tasks import TASKS
+
     trials = getattr(chosen, "TRIALS", {})
     if options.trial is not None and options.trial not in trials:
         known = ", ".join(map(repr, trials)) or "none"
         raise ValueError(f"--trial is {options.trial!r}; expected one of those of {options.task}: {known}")
-    if options.mujoco and getattr(chosen, "ACTOR", [("",)])[0][0] != "base velocity":
+    tracks = options.task not in TASKS or getattr(chosen, "ACTOR", [("",)])[0][0] == "base velocity"
+    if options.mujoco and not tracks:  # of other tasks the exported file says it
         raise ValueError(f"--mujoco with {options.task}; expected a task that tracks velocities, such as go2-flat")
+    for asked, name in (options.view, "--view"), (options.mujoco, "--mujoco"):
+        if asked and not hasattr(chosen, "ROBOT"):
+            raise ValueError(f"{name} with {options.task}; expected a task with ROBOT, the path of its MJCF file")
     for asked, module in (options.film == "mp4", "imageio_ffmpeg"), (options.view, "pyglet"):
         if asked and importlib.util.find_spec(module) is None:
             raise ImportError(f"{module} is missing; pip install {module.replace('_', '-')}")
@@ -106,15 +131,22 @@ def checked(options: argparse.Namespace, chosen: Any) -> dict[str, str]:
     return {} if options.trial is None else {"trial": options.trial}
 
 
-def walk_in_mujoco(runner: Any, env: Any, name: str, worlds: int = 64) -> dict[str, float]:
+def robot_file(chosen: Any) -> Path:
+    """Return the MJCF file of a task's ROBOT: that of a ready robot, or a path, which begins at the task's file."""
+    from .env import robots
+
+    robot = str(chosen.ROBOT)
+    return robots.FILES / f"{robot}.xml" if robot in robots.NAMES else Path(chosen.__file__).parent / robot
+
+
+def walk_in_mujoco(runner: Any, env: Any, name: str, chosen: Any, worlds: int = 64) -> dict[str, float]:
     """Return what :func:`warp_spo.mujoco.deployment.trial` measures of a policy, with the robot file of its task."""
-    from .env import export, robots
-    from .env.tasks import task
+    from .env import export
     from .mujoco import deployment
 
     with tempfile.TemporaryDirectory() as folder:
         file, _ = export.save(runner, env, name, Path(folder) / "policy")
-        return deployment.trial(deployment.Deployment(file, robots.FILES / f"{task(name).ROBOT}.xml", worlds))
+        return deployment.trial(deployment.Deployment(file, robot_file(chosen), worlds))
 
 
 if __name__ == "__main__":

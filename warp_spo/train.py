@@ -1,9 +1,16 @@
 """Train a task, into checkpoints and a learning curve: ``python -m warp_spo.train TASK [--worlds N] [--device D]``.
 
+TASK is a ready task, FILE.py, package.module, or a name that a package registers: ``python -m warp_spo.tasks``.
+
 python -m warp_spo.train go2-flat                         # into runs/go2-flat
+python -m warp_spo.train go2-flat --resume latest         # go on where it was stopped, by Ctrl-C or a crash
 python -m warp_spo.train go2-flat --resume runs/go2-flat/model_399.pt --iterations 800
+python -m warp_spo.train my_task.py --set learner.entropy=0.01 --set rewards.velocity=3 --set episode_length_s=10
 python -m warp_spo.train go2-flat --gpus 4                # one process a GPU, each with --worlds worlds
 python -m warp_spo.train cartpole --gpus 2 --device cpu   # two processes on the CPU
+
+Ctrl-C and SIGTERM end after the iteration, with a checkpoint and the picture; the exit status is 130 or 143. A second
+Ctrl-C ends at once. Exit status 1: a file could not be written, or the policy would not be finite any more.
 """
 
 from __future__ import annotations
@@ -11,72 +18,125 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import subprocess
+import shlex
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
 BEGAN = time.time()
+SET = "a setting, such as learner.entropy=0.01, rewards.velocity=3, episode_length_s=10; may be repeated"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Train the task that the arguments name."""
+    """Train the task that the arguments name, and return the exit status."""
+    try:
+        return start(sys.argv[1:] if arguments is None else list(arguments))
+    except KeyboardInterrupt:
+        print("train: stopped at once", file=sys.stderr)
+        return 130
+
+
+def start(given: list[str]) -> int:
+    """Train in this process, or start those that train."""
     from .command_line import Parser, count, seconds
+    from .env.task_files import short_name
     from .env.tasks import TASKS, task
     from .env.validation import check_folder
 
     parser = Parser(
         prog="python -m warp_spo.train", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("task", choices=sorted(TASKS))
+    parser.add_argument("task", help=f"{', '.join(TASKS)}, FILE.py, package.module, or a name that a package registers")
     parser.add_argument("--worlds", type=count, help="of each GPU; left out: as the task says")
     parser.add_argument("--device", help="such as cuda:0 or cpu; left out: cuda:0 if there is one")
-    parser.add_argument("--gpus", type=count, default=1, help="processes (torchrun), one a GPU, or with --device cpu")
+    parser.add_argument("--gpus", type=count, help="processes, one a GPU, or with --device cpu; left out: 1")
     parser.add_argument("--iterations", type=count, help="in all; left out: as the task says")
-    parser.add_argument(
-        "--seconds", type=seconds, default=math.inf, help="from the start, after which it stops; one GPU"
-    )
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seconds", type=seconds, default=math.inf, help="from the start, after which it stops")
+    parser.add_argument("--seed", type=int, help="left out: 0")
     parser.add_argument("--out", type=Path, help="folder; left out: runs/TASK")
-    parser.add_argument("--resume", type=Path, help="checkpoint to continue from")
-    parser.add_argument("--save-interval", type=count, default=100, help="iterations between checkpoints")
-    options = parser.parse_args(arguments)
-    folder = options.out or Path("runs") / options.task
+    parser.add_argument(
+        "--resume", type=Path, help="checkpoint to go on from; latest: the newest of the folder, if any"
+    )
+    parser.add_argument("--save-interval", type=count, help="iterations between checkpoints; left out: 100")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes", help=SET)
+    parser.add_argument("--settings", type=Path, metavar="FILE.toml", help="such settings in a file")
+    options = parser.parse_args(given)
+    if int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) and options.resume is None:
+        options.resume = Path("latest")  # torchrun has started anew what was killed
+    load_learning(parser)
+    from .env import settings, training_files
+
     try:
-        check_folder(folder, options.resume)
+        chosen = task(options.task)
+        options.out = options.out or Path("runs") / short_name(options.task)
+        check_folder(options.out, options.resume)
+        if str(options.resume) == training_files.LATEST:
+            before: Path | None = options.out
+        else:
+            before = None if options.resume is None else options.resume.parent
+        run, tree = settings.gather(before, short_name(options.task), options.settings, options.changes)
+        own, options.given = settings.split(tree)
+        learner = settings.changed(chosen.LEARNER, own, "learner")
     except (ValueError, OSError) as error:
         parser.error(str(error))
-    if options.gpus > 1 and "LOCAL_RANK" not in os.environ:
-        if options.device not in (None, "cpu"):
-            parser.error(f"--gpus {options.gpus} with --device {options.device}; expected no --device, or cpu")
-        if math.isfinite(options.seconds):
-            parser.error(f"--gpus {options.gpus} with --seconds; expected --iterations, for all processes to stop at")
-        given = sys.argv[1:] if arguments is None else arguments
-        run = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={options.gpus}"]
-        return subprocess.call([*run, "-m", "warp_spo.train", *given])
+    options.gpus = options.gpus or run.get("processes", 1)
+    options.seed = run.get("seed", 0) if options.seed is None else options.seed
+    options.save_interval = options.save_interval or run.get("save_interval", 100)
+    options.worlds = options.worlds or run.get("worlds") or learner.worlds
+    options.iterations = options.iterations or run.get("iterations") or learner.iterations
+    if options.gpus == 1 or "LOCAL_RANK" in os.environ:
+        return learn(parser, options, chosen, learner, given)
+    if options.device not in (None, "cpu"):
+        parser.error(f"--gpus {options.gpus} with --device {options.device}; expected no --device, or cpu")
+    from .env.launcher import launch
 
+    return launch([sys.executable, "-m", "warp_spo.train", *given], options.gpus)
+
+
+def learn(parser: Any, options: argparse.Namespace, chosen: Any, learner: Any, given: list[str]) -> int:
+    """Train in this process, and return the exit status."""
     learning = load_learning(parser)
+    from .env import settings
+    from .env.task_files import build, short_name
     from .env.training_log import draw_curve
 
-    rank = int(os.environ.get("RANK", 0))
-    chosen = task(options.task)
-    worlds = options.worlds or chosen.LEARNER.worlds
+    rank, folder, worlds = int(os.environ.get("RANK", 0)), options.out, options.worlds
+    name = short_name(options.task)
     try:
         device = learning.pick_device(options.device)
-        env = chosen.build(worlds, device, seed=options.seed, first_world=rank * worlds)
-        print(f"{options.task}: {worlds} worlds on {device}, {time.time() - BEGAN:.1f} s", flush=True)
+        env = build(chosen, worlds, device, options.seed, options.given, first_world=rank * worlds)
+        print(f"{name}: {worlds} worlds on {device}, {time.time() - BEGAN:.1f} s", flush=True)
         runner, iterations = learning.prepare(
-            env, chosen.LEARNER, folder, options.iterations, options.resume, options.seed + rank,
-            options.save_interval, began=BEGAN, seconds=options.seconds,
+            env, learner, folder, options.iterations, options.resume, options.seed + rank, options.save_interval,
+            began=BEGAN, seconds=options.seconds,
         )  # fmt: skip
+        run = {"task": name, "command": shlex.join(["python", "-m", "warp_spo.train", *given]), "worlds": worlds,
+               "processes": int(os.environ.get("WORLD_SIZE", 1)), "iterations": options.iterations,
+               "seed": options.seed, "save_interval": options.save_interval}  # fmt: skip
+        if rank == 0:
+            settings.write(folder, run, learner, options.given)
     except (ValueError, OSError) as error:
         parser.error(str(error))
-    learning.run(runner, iterations)
+    ending = learning.run(runner, iterations)
     if rank == 0:
-        print(f"{folder}: checkpoints, progress.jsonl, {draw_curve(folder, options.task).name}")
+        try:
+            print(f"{folder}: checkpoints, progress.jsonl, {draw_curve(folder, name).name}")
+        except (OSError, ValueError, IndexError) as error:
+            why = f"curve.png ({getattr(error, 'strerror', None) or error})"
+            ending = ending._replace(unwritten=(*ending.unwritten, why))
+        if ending.status:
+            again = "" if ending.unwritten else f"; go on: {continuation(given)}"
+            print(f"{folder}: {learning.describe_end(ending)}{again}", flush=True)
     learning.leave()
-    return 0
+    return ending.status
+
+
+def continuation(given: list[str]) -> str:
+    """Return the command that goes on with a training that these arguments began."""
+    kept = [text for i, text in enumerate(given) if given[i - 1 : i] != ["--resume"]]
+    kept = [text for text in kept if text.split("=")[0] != "--resume"]
+    return shlex.join(["python", "-m", "warp_spo.train", *kept, "--resume", "latest"])
 
 
 def load_learning(parser: Any) -> Any:

@@ -142,11 +142,6 @@ def test_a_resumed_training_drops_the_rows_after_its_checkpoint(trained, tmp_pat
         ("train", ["--resume", "OTHER"], "has no actor_state_dict, critic_state_dict, iter, optimizer_state_dict"),
         ("train", ["--out", "TRAINED"], "holds a training"),
         ("train", ["--out", "TRAINED", "--gpus", "2", "--device", "cpu"], "holds a training"),
-        (
-            "train",
-            ["--gpus", "2", "--device", "cpu", "--seconds", "9"],
-            "--gpus 2 with --seconds; expected --iterations",
-        ),
         ("train", ["--resume", "GOOD", "--iterations", "2"], "has 3 iterations, and 2 are asked for in all"),
         ("play", ["nowhere.pt"], "No such file or directory: 'nowhere.pt'"),
         ("play", ["GOOD", "--seconds", "0"], "expected seconds, more than zero"),

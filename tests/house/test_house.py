@@ -40,6 +40,7 @@ ROOMS = (
     "trials",
     "env",
     "command_line",
+    "tasks",
     "train",
     "play",
     "examples",

@@ -67,7 +67,7 @@ def start_at(self: Env, levels: Mapping[str, torch.Tensor]) -> None:
 
 
 def state_dict(self: Env) -> dict[str, torch.Tensor]:
-    """Return copies of all tensors that the next steps depend on, by name.
+    """Return copies of all tensors that the next steps and logs depend on, by name.
 
     ``torch.save`` stores them. An environment that is made with the same arguments goes on from them to the bit, on the
     same device: :meth:`load_state_dict`.

@@ -46,7 +46,7 @@ class Log:
             for name in sums
         ]
         self._belongs = torch.tensor(belongs, device=device)  # [count, cause]
-        self.cut = torch.zeros(worlds, device=device)
+        self.cut = torch.zeros(worlds, device=device)  # number of a world's episode whose age was written; 0: none
 
     def clear(self) -> None:
         """Forget whose ages were written."""

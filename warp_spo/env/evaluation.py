@@ -59,6 +59,14 @@ def mean(values: torch.Tensor, valid: torch.Tensor) -> float:
     return float((values * valid).sum() / valid.sum().clamp(min=1))
 
 
+def episodes(env: Env, policy: Policy) -> dict[str, float]:
+    """Return the means of rewards, ends and lengths [s] over an episode of each world, as the log of a training has."""
+    observed, _ = env.reset(seed=env.seed)
+    for _ in range(env.max_episode_length):
+        observed, *_ = env.step(policy(observed))
+    return {"worlds": env.num_envs} | {name.lstrip("/"): float(value) for name, value in env.log().items()}
+
+
 def balance(env: Env, policy: Policy) -> dict[str, float]:
     """Return how many worlds hold the pole within 0.1 rad for 90 % of an episode's last 5 s, and the least share."""
     steps = env.max_episode_length - 1

@@ -11,22 +11,21 @@ import dataclasses
 import io
 import math
 import os
-import pickle
+import signal
 import time
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.modules.distribution import GaussianDistribution
-from rsl_rl.runners import OnPolicyRunner
 
-from ..errors import as_integer
 from ..runtime.arrays import parse_device
+from . import training_files
 from .environment import Env
-from .training_log import TimeLimitReached, TrainingLog
+from .runner import Runner, describe_end, load_checkpoint, run
+from .training_log import TrainingLog
 from .validation import check_folder, check_number, check_positive, check_whole
 
 DEVIATIONS = (0.05, 2.0)  # range of the deviation of actions
@@ -125,6 +124,8 @@ class CapturedPPO(PPO):
 
     graph: Any = None
     captures = True
+    _kept: tuple[torch.Tensor, ...] = ()  # what was learned before this iteration
+    _kept_rate = 0.0
 
     def act(self, obs: Any) -> torch.Tensor:
         """Sample actions and keep what the storage needs, as PPO does."""
@@ -151,7 +152,12 @@ class CapturedPPO(PPO):
         return self.transition.actions  # type: ignore[return-value]
 
     def update(self) -> dict[str, float]:
-        """Learn, and keep the normalisers' deviations where the graph reads them."""
+        """Learn, and keep the normalisers' deviations where the graph reads them.
+
+        Raises:
+            NotFiniteError: the policy is not finite any more; it is again what it was before, and so is the optimizer.
+        """
+        self._keep()
         models = [model.obs_normalizer for model in (self.actor, self.critic) if model.obs_normalization]
         places = [model._std for model in models]
         losses = super().update()
@@ -159,32 +165,79 @@ class CapturedPPO(PPO):
             for model, place in zip(models, places, strict=True):
                 place.copy_(model._std)
                 model._std = place
+        if not self._is_finite():
+            self._keep(back=True)
+            raise NotFiniteError(self._find_term())
         return losses
+
+    def _learned(self) -> list[torch.Tensor]:
+        """Return the tensors that learning changes: networks, normalisers, the optimizer's state."""
+        networks = [*self._raw_actor.state_dict().values(), *self._raw_critic.state_dict().values()]
+        state = [value for each in self.optimizer.state.values() for value in each.values()]
+        return networks + [value for value in state if isinstance(value, torch.Tensor)]
+
+    @torch.no_grad()
+    def _keep(self, back: bool = False) -> None:
+        """Copy what learning changes; ``back``: make it what it was, the learning rate, too."""
+        tensors = self._learned()
+        if back:
+            steps = len(self._kept) < len(tensors)  # the optimizer had taken none
+            torch._foreach_copy_(tensors[: len(self._kept)], self._kept)
+            self.learning_rate = self._kept_rate
+            for group in self.optimizer.param_groups:
+                group["lr"] = self.learning_rate
+            if steps:
+                self.optimizer.state.clear()
+            return
+        if [x.shape for x in self._kept] != [x.shape for x in tensors]:
+            self._kept = tuple(torch.empty_like(x) for x in tensors)
+        torch._foreach_copy_(self._kept, tensors)
+        self._kept_rate = self.learning_rate
+
+    def _is_finite(self) -> bool:
+        """Return whether networks and normalisers hold finite numbers alone, the same in all processes."""
+        models = (self._raw_actor, self._raw_critic)
+        numbers = [x for model in models for x in model.state_dict().values() if x.is_floating_point()]
+        return bool(torch.stack(torch._foreach_norm(numbers, math.inf)).isfinite().all())
+
+    def _find_term(self) -> str:
+        """Learn again from the same rollout up to the first gradient that is not finite; name the terms of its loss."""
+
+        def look(optimizer: Any, *_: Any) -> None:
+            gradients = [w.grad for group in optimizer.param_groups for w in group["params"] if w.grad is not None]
+            if not bool(torch.stack(torch._foreach_norm(gradients, math.inf)).isfinite().all()):
+                raise FloatingPointError
+
+        hook = self.optimizer.register_step_pre_hook(look)
+        try:
+            super().update()
+        except FloatingPointError as error:
+            terms = loss_terms(error)
+            bad = [name for name, value in terms.items() if not math.isfinite(value)]
+            return f"loss {', '.join(bad)} not finite" if bad else "the gradient of a finite loss is not finite"
+        finally:
+            hook.remove()
+            self._keep(back=True)
+        return "observations that are not finite reached the normalisers"
+
+
+class NotFiniteError(FloatingPointError):
+    """Learning has made a policy that is not finite; the message names the terms of the loss."""
+
+
+def loss_terms(error: BaseException) -> dict[str, float]:
+    """Return the terms of the loss where an error interrupted rsl_rl's ``PPO.update``, by their names in the log."""
+    frame = error.__traceback__
+    while frame is not None:
+        found = frame.tb_frame.f_locals
+        if "surrogate_loss" in found:
+            names = {"surrogate": "surrogate_loss", "value": "value_loss", "entropy": "entropy"}
+            return {name: float(found[local].detach().mean()) for name, local in names.items()}
+        frame = frame.tb_next
+    return {}
 
 
 KEPT = ("actions", "values", "actions_log_prob", "distribution_params", "hidden_states")
-
-
-class Runner(OnPolicyRunner):
-    """rsl_rl's runner, whose checkpoints hold the levels of curricula.
-
-    Processes without GPUs average gradients through gloo, where rsl_rl knows NCCL alone.
-    """
-
-    def save(self, path: str, infos: dict | None = None) -> None:
-        """Save networks, the optimizer's state, and how far this process's worlds have come in curricula."""
-        reached = {name: tensor.cpu().clone() for name, tensor in self.env.levels().items()}
-        super().save(path, (infos or {}) | {"levels": reached})
-
-    def _configure_multi_gpu(self) -> None:
-        size = int(os.environ.get("WORLD_SIZE", "1"))
-        if self.device != "cpu" or size == 1:
-            return super()._configure_multi_gpu()
-        self.gpu_world_size, self.is_distributed = size, True
-        self.gpu_global_rank, self.gpu_local_rank = (int(os.environ[name]) for name in ("RANK", "LOCAL_RANK"))
-        ranks = {"global_rank": self.gpu_global_rank, "local_rank": self.gpu_local_rank}
-        self.cfg["multi_gpu"] = ranks | {"world_size": size}
-        torch.distributed.init_process_group("gloo", rank=self.gpu_global_rank, world_size=size)
 
 
 def pick_device(asked: str | None) -> str:
@@ -206,131 +259,83 @@ def pick_device(asked: str | None) -> str:
 def make_runner(
     env: Env, learner: Learner, folder: Path | None = None, save_interval: int = 100, every: int = 10,
     began: float | None = None, seconds: float = math.inf,
-) -> OnPolicyRunner:  # fmt: skip
+) -> Runner:  # fmt: skip
     """Return rsl_rl's runner on an environment, which logs the training in ``folder``; see :func:`train`."""
     for name, value in (("save_interval", save_interval), ("every", every)):
         check_whole("train", name, value, 1)
     check_positive("train", "seconds", seconds, endless=True)
     with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints every layer of both networks
-        runner = Runner(env, learner.settings(env, save_interval), None, device=str(env.device))
+        runner = Runner(env, learner.settings(env, save_interval), str(env.device))
     began = time.time() if began is None else began
-    runner.logger = TrainingLog(env, folder, every, began, runner.gpu_global_rank == 0, seconds)  # type: ignore[assignment]
+    log = TrainingLog(env, folder, every, began, runner.gpu_global_rank == 0, seconds, runner.end_iteration)
+    runner.logger = log  # type: ignore[assignment]
     return runner
-
-
-def load_checkpoint(runner: OnPolicyRunner, file: str | Path, learns: bool = True) -> int:
-    """Load a checkpoint, tensors and numbers only, and return its iteration.
-
-    Args:
-        runner: what takes it. file: of a training of the same task. learns: whether it takes the optimizer's state.
-
-    Raises:
-        OSError: there is no such file. ValueError: it is no checkpoint, or that of networks with other sizes.
-    """
-    try:
-        found = torch.load(file, weights_only=True, map_location=runner.device)
-        missing = {"actor_state_dict", "critic_state_dict", "optimizer_state_dict", "iter"} - set(found)
-    except (pickle.UnpicklingError, EOFError, KeyError, RuntimeError, TypeError) as error:
-        raise ValueError(
-            f"checkpoint {str(file)!r}: cannot be read ({type(error).__name__}); expected a model_N.pt of a training"
-        ) from None
-    if missing:
-        raise ValueError(
-            f"checkpoint {str(file)!r}: has no {', '.join(sorted(missing))}; expected a model_N.pt of a training"
-        )
-    parts = {"actor": True, "critic": True, "optimizer": learns, "iteration": True, "rnd": False}
-    iteration, levels = found["iter"], (found.get("infos") or {}).get("levels", {})
-    if as_integer(iteration) is None or not isinstance(levels, Mapping):
-        raise ValueError(
-            f"checkpoint {str(file)!r}: iter is {iteration!r}, its levels are {type(levels).__name__}; expected an "
-            "integer, and a dictionary: a model_N.pt of a training"
-        )
-    try:
-        runner.alg.load(found, parts, strict=True)
-    except RuntimeError as error:
-        first = next((line.strip() for line in str(error).splitlines()[1:]), str(error))
-        raise ValueError(
-            f"checkpoint {str(file)!r}: does not fit the task's networks ({first}); expected one of the same task"
-        ) from None
-    if learns:
-        runner.current_learning_iteration = iteration + 1
-        resume_levels(runner.env, file, levels)
-    return int(iteration)
-
-
-def resume_levels(env: Env, file: str | Path, levels: Mapping[str, torch.Tensor]) -> None:
-    """Start worlds at a checkpoint's levels of curricula; warn where it has none and the environment has."""
-    if levels.keys() != env.levels().keys():
-        warnings.warn(
-            f"checkpoint {str(file)!r}: has levels of {', '.join(levels) or 'nothing'}, the task's curricula are "
-            f"{', '.join(env.levels()) or 'none'}; worlds begin at the first levels",
-            stacklevel=3,
-        )
-    elif levels:
-        env.start_at(levels)
 
 
 def prepare(
     env: Env, learner: Learner, folder: str | Path, iterations: int | None = None, resume: str | Path | None = None,
     seed: int = 0, save_interval: int = 100, every: int = 10, began: float | None = None, seconds: float = math.inf,
-) -> tuple[OnPolicyRunner, int]:  # fmt: skip
+) -> tuple[Runner, int]:  # fmt: skip
     """Return a runner that is ready to train, and how many iterations are left; see :func:`train`."""
     check_folder(folder, resume)
     if iterations is not None:
         check_whole("train", "iterations", iterations, 1)
     torch.manual_seed(check_whole("train", "seed", seed, 0, 2**64 - 1))
     folder = Path(folder)
+    if str(resume) == training_files.LATEST:
+        resume = training_files.newest(folder)  # None: a training that begins
     runner = make_runner(env, learner, folder, save_interval, every, began, seconds)
     first = load_checkpoint(runner, resume) + 1 if resume is not None else 0
     runner.logger.first = first  # type: ignore[attr-defined]
     total = learner.iterations if iterations is None else iterations
-    if runner.is_distributed and seconds < math.inf:
-        raise ValueError(
-            f"train: seconds {seconds} and several processes; expected iterations alone, for all to stop at"
-        )
     if first >= total:
         has = "no checkpoint" if resume is None else repr(str(resume))
         raise ValueError(f"train: {has} has {first} iterations, and {total} are asked for in all; expected more")
     folder.mkdir(parents=True, exist_ok=True)
+    runner.logger.init_logging_writer()
     return runner, total - first
-
-
-def run(runner: OnPolicyRunner, iterations: int) -> None:
-    """Train so many iterations, or until the time is over; then leave a checkpoint."""
-    try:
-        runner.learn(iterations, init_at_random_ep_len=True)
-    except TimeLimitReached:
-        runner.save(str(Path(runner.logger.log_dir) / f"model_{runner.current_learning_iteration}.pt"))
 
 
 def train(
     env: Env, learner: Learner, folder: str | Path, iterations: int | None = None, resume: str | Path | None = None,
     seed: int = 0, save_interval: int = 100, every: int = 10, began: float | None = None, seconds: float = math.inf,
-) -> OnPolicyRunner:  # fmt: skip
-    """Train, and leave checkpoints ``model_N.pt`` and ``progress.jsonl`` in a folder.
+) -> Runner:  # fmt: skip
+    """Train, and leave checkpoints ``model_N.pt``, ``last.pt`` with the worlds, and ``progress.jsonl`` in a folder.
 
     Under torchrun each process has its own worlds, gradients and normalisers are averaged over all, and the first
-    process writes; its log is of its own worlds.
+    process writes; its log is of its own worlds. Ctrl-C and SIGTERM end after the iteration, with checkpoints; they
+    are raised then, as KeyboardInterrupt and SystemExit. A checkpoint that cannot be written is a warning, and is tried
+    again every ``every`` iterations.
 
     Args:
         env: the environment.
         learner: settings.
         folder: is made; a training that resumes may continue in its own, whose rows after the checkpoint are dropped.
         iterations: in all, those before ``resume`` included; None: as the settings say.
-        resume: checkpoint to continue from.
+        resume: checkpoint to continue from, or "latest": the newest whole one of the folder, if it has any. From
+            ``last.pt`` the training has the bits of one that was not stopped, on a CPU.
         seed: of the learner's random numbers.
         save_interval: iterations from one checkpoint to the next.
         every: iterations from one printed line to the next.
         began: time from which seconds count, as of ``time.time``.
-        seconds: after which no iteration starts; for one process.
+        seconds: after which no iteration starts, in any of the processes.
 
     Raises:
         ValueError: the folder holds another training, the checkpoint is not of this task, or nothing is left to do; or
             a number of iterations or seconds is none, or not above zero.
         OSError: there is no such checkpoint, or the folder cannot be made.
+        FloatingPointError: learning made a policy that is not finite; the last one before is kept as a checkpoint.
     """
     runner, left = prepare(env, learner, folder, iterations, resume, seed, save_interval, every, began, seconds)
-    run(runner, left)
+    ending = run(runner, left)
+    if ending.fault:
+        raise FloatingPointError(f"train: {describe_end(ending)}")
+    if ending.unwritten:
+        warnings.warn(f"train: {describe_end(ending)}", stacklevel=2)
+    if ending.signal == signal.SIGINT:
+        raise KeyboardInterrupt(f"train: {describe_end(ending)}")
+    if ending.signal:
+        raise SystemExit(ending.status)
     return runner
 
 
@@ -340,7 +345,7 @@ def leave() -> None:
         torch.distributed.destroy_process_group()
 
 
-def policy_of(runner: OnPolicyRunner) -> Any:
+def policy_of(runner: Runner) -> Any:
     """Return the function from observations (a TensorDict) to actions that the training has found."""
     model = runner.get_inference_policy(str(runner.device))
 

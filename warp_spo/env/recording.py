@@ -156,13 +156,16 @@ def _draw(
     return films.pictures(scene, drawn, recorded.q[rows], camera, follow, beside, texts, recorded.device)
 
 
-def show(name: str, recorded: Rollout, step: float) -> None:
-    """Play a recording in Newton's viewer, in real time, again and again until its window is closed."""
+def show(robot: str | Path, recorded: Rollout, step: float) -> None:
+    """Play a recording in Newton's viewer, in real time, again and again until its window is closed.
+
+    ``robot``: one of ``robots.NAMES``, or a file of MJCF.
+    """
     import time
 
     from ..viewing.viewer import Viewer
 
-    viewer = Viewer(robots.FILES / f"{name}.xml")
+    viewer = Viewer(robots.FILES / f"{robot}.xml" if robot in robots.NAMES else Path(robot))
     while viewer.is_running():
         for q in recorded.q:
             viewer.show(q, step)

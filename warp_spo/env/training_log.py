@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import time
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
+from .training_files import write_bytes
+
 if TYPE_CHECKING:
     from .environment import Env
-
-
-class TimeLimitReached(Exception):
-    """The time that a training may take is over."""
 
 
 class TrainingLog:
@@ -26,24 +27,32 @@ class TrainingLog:
     """
 
     def __init__(
-        self, env: Env, folder: Path | None, every: int, began: float, writes: bool, seconds: float = math.inf
+        self, env: Env, folder: Path | None, every: int, began: float, writes: bool, seconds: float = math.inf,
+        after: Callable[[int, int], None] | None = None,
     ):  # fmt: skip
         self.env, self.log_dir, self.every, self.began = env, folder and str(folder), every, began
-        self.ends = began + seconds
-        self.writer = self if folder is not None and writes else None
+        self.ends, self.after = began + seconds, after
+        self.writes, self.writer = folder is not None and writes, None  # rsl_rl has nothing to write
         self.first = 0  # iteration
         self.rows: list[dict[str, float]] = []
         self.git_status_repos: list[str] = []
+        self.file: Path | None = None
+        self.unwritten: dict[str, str] = {}
+        self._size, self._waiting = 0, b""  # bytes of the file that are whole, and those that it still lacks
 
     def init_logging_writer(self) -> None:
         """Continue the rows of the training that is resumed, up to its checkpoint; its seconds count."""
-        if self.writer is not None:
-            self.file = Path(self.log_dir) / "progress.jsonl"  # type: ignore[arg-type]
-            if self.file.exists():
-                self.rows = [row for row in read_rows(self.file) if row["iteration"] < self.first]
-                self.file.write_text("".join(json.dumps(row) + "\n" for row in self.rows))
-            if self.rows:
-                self.began -= self.rows[-1]["seconds"]
+        if not self.writes or self.file is not None:
+            return
+        file = Path(self.log_dir) / "progress.jsonl"  # type: ignore[arg-type]
+        if file.exists():
+            self.rows = [row for row in read_rows(file) if row["iteration"] < self.first]
+            text = lines_of(self.rows)
+            write_bytes(file, text)
+            self._size = len(text)
+        if self.rows:
+            self.began -= self.rows[-1]["seconds"]
+        self.file = file
 
     def process_env_step(self, *_: Any) -> None:
         """Do nothing."""
@@ -51,9 +60,15 @@ class TrainingLog:
     def log(
         self, it: int, total_it: int, collect_time: float, learn_time: float, loss_dict: dict, **others: Any
     ) -> None:
-        """Write an iteration."""
-        if self.writer is None:
-            return
+        """Write an iteration, and do what comes after it."""
+        if self.writes:
+            self._write(it, total_it, collect_time, learn_time, loss_dict, others)
+        if self.after is not None:
+            self.after(it, total_it)
+
+    def _write(
+        self, it: int, total_it: int, collect_time: float, learn_time: float, loss_dict: dict, others: dict
+    ) -> None:
         found = self.env.log()
         numbers = torch.stack([value.float() for value in found.values()]).tolist()
         row: dict[str, float] = {
@@ -69,16 +84,40 @@ class TrainingLog:
         }
         row["reward"] = sum(value for name, value in row.items() if name.startswith("/reward/"))
         self.rows.append(row)
-        with self.file.open("a") as file:
-            file.write(json.dumps({name: float(f"{value:.6g}") for name, value in row.items()}) + "\n")
+        self._append(lines_of([row]))
         if it % self.every == 0 or it + 1 == total_it:
             reward = f"{row['reward']:8.3f}" if row["/episode/finished"] else f"{'-':>8}"
             length = f"{row['/episode/seconds']:5.1f}" if row["/episode/whole"] else f"{'-':>5}"
             print(f"iteration {it:4d} of {total_it}  {row['seconds']:6.1f} s  reward {reward}  "
                   f"episode {length} s  collecting {1e3 * collect_time:4.0f} ms  "
                   f"learning {1e3 * learn_time:4.0f} ms", flush=True)  # fmt: skip
-        if time.time() > self.ends:
-            raise TimeLimitReached
+
+    def _append(self, text: bytes) -> None:
+        """Write lines behind those of the file that are whole; what a full disk leaves out is tried again later."""
+        self._waiting += text
+        try:
+            with self.file.open("ab", buffering=0) as out:  # type: ignore[union-attr]
+                if out.tell() < self._size:  # another file: that one is lost
+                    self._size, self._waiting = 0, lines_of(self.rows)
+                out.truncate(self._size)
+                while self._waiting:
+                    done = out.write(self._waiting)
+                    self._size, self._waiting = self._size + done, self._waiting[done:]
+            self.unwritten = {}
+        except OSError as error:
+            if not self.unwritten:
+                words = f"{str(self.file)!r} could not be written ({error.strerror}); its rows are kept and tried again"
+                warnings.warn(f"train: {words} after each iteration", stacklevel=2)
+            self.unwritten = {self.file.name: error.strerror or str(error)}  # type: ignore[union-attr]
+
+    def flush(self) -> None:
+        """Bring all rows onto the disk."""
+        if self.file is None or not self.rows:
+            return
+        self._append(b"")
+        if not self.unwritten:
+            with self.file.open("rb") as held:
+                os.fsync(held.fileno())
 
     def save_model(self, *_: Any) -> None:
         """Do nothing: checkpoints stay in the folder."""
@@ -98,9 +137,34 @@ def peak_memory(device: Any) -> dict[str, float]:
     )
 
 
+def lines_of(rows: list[dict[str, float]]) -> bytes:
+    """Return rows as the lines of a ``progress.jsonl``."""
+    lines = (json.dumps({name: float(f"{value:.6g}") for name, value in row.items()}) + "\n" for row in rows)
+    return "".join(lines).encode()
+
+
 def read_rows(file: Path) -> list[dict[str, float]]:
-    """Return the rows of a ``progress.jsonl``."""
-    return [json.loads(line) for line in file.read_text().splitlines()]
+    """Return the rows of a ``progress.jsonl``; a last line that was torn while it was written is left out.
+
+    Raises:
+        ValueError: another line is no row; the message names it.
+    """
+    lines = file.read_bytes().decode(errors="replace").split("\n")
+    rows = []
+    for number, line in enumerate(lines, 1):
+        if number == len(lines):  # empty, or without its end
+            break
+        try:
+            row = json.loads(line)
+            if not isinstance(row["iteration"], int | float) or not isinstance(row["seconds"], int | float):
+                raise KeyError
+        except (ValueError, TypeError, KeyError):
+            raise ValueError(
+                f"{str(file)!r}: line {number} is no row of a training ({line[:40]!r}); remove the line, or move the "
+                "file away"
+            ) from None
+        rows.append(row)
+    return rows
 
 
 def draw_curve(folder: str | Path, name: str) -> Path:

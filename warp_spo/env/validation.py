@@ -88,7 +88,12 @@ def check_mapping(call: str, name: str, value: Any, expected: str) -> dict[str, 
 
 
 def check_folder(folder: str | Path, resume: str | Path | None) -> None:
-    """Raise ValueError for a folder that holds another training, and OSError for a checkpoint that is not there."""
+    """Raise ValueError for a folder that holds another training, and OSError for a checkpoint that is not there.
+
+    "latest" is a checkpoint of the folder, or none where a training begins.
+    """
+    if str(resume) == "latest":
+        return
     if resume is not None:
         Path(resume).open("rb").close()
     elif (Path(folder) / "progress.jsonl").exists():

@@ -236,9 +236,9 @@ class FusedKernel:
         early = [item for item in others if at_once(item) and item.array not in wide]
         if self.rows:
             listings = [emitter.region(items) for items in self.of_rows]
-            *parts, last = (render(listing, "float32") for listing in listings)
+            *parts, closing = (render(listing, "float32") for listing in listings)
             over = f"if (row + {(self.at_once - 1) * self.threads} < {self.rows})"  # the last ones may be too many
-            return listings, [*parts, over + " {", last, "}"]
+            return listings, [*parts, over + " {", closing, "}"]
         listings = [emitter.region(early, [item.value for item in late])]
         parts = [render(listings[0], "float32")]
         for name, stretches in wide.items():

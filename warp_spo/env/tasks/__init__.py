@@ -19,10 +19,16 @@ TASKS = {
 
 
 def task(name: str) -> Any:
-    """Return the module of a task; ValueError if there is none of this name."""
-    if name not in TASKS:
-        raise ValueError(f"make: task {name!r} is unknown; expected one of {', '.join(TASKS)}")
-    return importlib.import_module(f".{TASKS[name]}", __package__)
+    """Return the module of a task: a ready one, FILE.py, package.module, or one of the entry points "warp_spo.tasks".
+
+    Raises:
+        ValueError: there is none, or it lacks ``build`` or ``LEARNER``; the message has the line.
+    """
+    if name in TASKS:
+        return importlib.import_module(f".{TASKS[name]}", __package__)
+    from ..task_files import load
+
+    return load(name, TASKS)
 
 
 OPEN = ("first_world", "passes", "granularity", "graph", "log_interval", "final_observations", "bounds", "cfg")

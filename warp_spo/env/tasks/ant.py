@@ -10,6 +10,7 @@ from ... import where
 from ...viewing import Camera
 from .. import Env, Observation, World, actions, evaluation, events, observations, rewards, robots, terminations
 from ..learning import Learner
+from ..settings import make_env
 from . import velocity
 
 ROBOT = "ant"
@@ -48,10 +49,11 @@ def straight(w: World) -> Any:
 def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env:
     """Return the environment; ``options`` go to :class:`Env`."""
     robot = robots.load(ROBOT)
-    return Env(
+    return make_env(
         robot.scene,
         worlds,
         device,
+        options,
         seed=seed,
         dt=5e-3,
         decimation=4,
@@ -89,7 +91,6 @@ def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env
         },
         events=[events.base(yaw=(-0.2, 0.2)), events.joints(position=(-0.1, 0.1), velocity=(-0.1, 0.1))],
         episode_length_s=15.0,
-        **options,
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from ...viewing import Camera
 from .. import Env, Observation, World, actions, evaluation, events, observations, robots
 from ..learning import Learner
+from ..settings import make_env
 
 ROBOT = "cartpole"
 CAMERA = Camera(distance=5.0, elevation=0.15)
@@ -45,10 +46,11 @@ def effort(w: World) -> Any:
 def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env:
     """Return the environment; ``options`` go to :class:`Env`."""
     robot = robots.load(ROBOT)
-    return Env(
+    return make_env(
         robot.scene,
         worlds,
         device,
+        options,
         seed=seed,
         dt=0.01,
         decimation=4,
@@ -62,7 +64,6 @@ def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env
             events.joints(position=(-np.pi, np.pi), velocity=(-1.0, 1.0), names="hinge"),
         ],
         episode_length_s=10.0,
-        **options,
     )
 
 

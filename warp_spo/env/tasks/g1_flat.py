@@ -9,6 +9,7 @@ import numpy as np
 from ...viewing import Camera
 from .. import Env, actions, commands, evaluation, rewards, robots, terminations
 from ..learning import Learner
+from ..settings import make_env
 from . import velocity
 
 ROBOT = "g1"
@@ -32,10 +33,11 @@ def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env
     robot = robots.load(ROBOT, contacts=("sole", "knee"))
     values = robot.scene.values
     scale = SCALE * values["actuator_force_range"][0, :, 1] / values["actuator_gain"][0]
-    return Env(
+    return make_env(
         robot.scene,
         worlds,
         device,
+        options,
         seed=seed,
         dt=5e-3,
         decimation=4,
@@ -64,7 +66,6 @@ def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env
         terminations={"fell over": terminations.tilted(np.radians(60.0)), "too low": terminations.below(0.45)},
         events=[*velocity.starts(), *velocity.randomisation("torso_link")],
         episode_length_s=20.0,
-        **options,
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from ...viewing import Camera
 from .. import Env, actions, commands, evaluation, rewards, robots, terminations
 from ..learning import Learner
+from ..settings import make_env
 from . import velocity
 
 ROBOT = "go2"
@@ -42,10 +43,11 @@ def reward_terms(height: float) -> dict[str, tuple[float, Any]]:
 def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env:
     """Return the environment; ``options`` go to :class:`Env`."""
     robot = robots.load(ROBOT, contacts=("foot", "trunk", "knee"))
-    return Env(
+    return make_env(
         robot.scene,
         worlds,
         device,
+        options,
         seed=seed,
         dt=5e-3,
         decimation=4,
@@ -62,7 +64,6 @@ def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env
         },
         events=[*velocity.starts(), *velocity.randomisation("base")],
         episode_length_s=20.0,
-        **options,
     )
 
 

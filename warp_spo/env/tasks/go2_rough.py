@@ -10,6 +10,7 @@ from ... import terrain
 from ...viewing import Camera
 from .. import Env, Observation, actions, commands, evaluation, events, observations, robots, terminations
 from ..learning import Learner
+from ..settings import make_env
 from . import go2_flat, velocity
 from .go2_flat import FEET, ROBOT
 
@@ -44,10 +45,11 @@ def build(worlds: int, device: Any = None, seed: int = 0, trial: str | None = No
     if trial is not None:
         wanted = commands.Velocity(forward=(0.6, 0.6), left=(0.0, 0.0), turn=(0.0, 0.0), seconds=(20.0, 20.0))
     place = events.terrain(tiles, rows=max(1, rows // 3), level=trial is None)
-    return Env(
+    return make_env(
         robot.scene,
         worlds,
         device,
+        options,
         seed=seed,
         dt=5e-3,
         decimation=4,
@@ -62,7 +64,6 @@ def build(worlds: int, device: Any = None, seed: int = 0, trial: str | None = No
         },
         events=[place, *velocity.starts(), *velocity.randomisation("base")],
         episode_length_s=20.0,
-        **options,
     )
 
 

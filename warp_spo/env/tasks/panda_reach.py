@@ -9,6 +9,7 @@ import numpy as np
 from ...viewing import Camera
 from .. import Env, Observation, World, actions, commands, evaluation, events, observations, rewards, robots
 from ..learning import Learner
+from ..settings import make_env
 
 ROBOT = "panda"
 CAMERA = Camera(distance=2.4, elevation=0.25, above=0.45)
@@ -35,10 +36,11 @@ def near(width: float) -> Any:
 def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env:
     """Return the environment; ``options`` go to :class:`Env`."""
     robot = robots.load(ROBOT)
-    return Env(
+    return make_env(
         robot.scene,
         worlds,
         device,
+        options,
         seed=seed,
         dt=0.01,
         decimation=2,
@@ -65,7 +67,6 @@ def build(worlds: int, device: Any = None, seed: int = 0, **options: Any) -> Env
         },
         events=[events.joints(position=(-0.3, 0.3))],
         episode_length_s=4 * PERIOD,
-        **options,
     )
 
 
