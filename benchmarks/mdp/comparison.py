@@ -184,10 +184,10 @@ class Comparison:
 
     def _sums(self, terms: dict[str, np.ndarray], ends: dict[str, np.ndarray], done: np.ndarray) -> None:
         """Compare the sums of each reward, and which ends a finished episode had."""
-        env = self.env
+        env, spoilt = self.env, ends["not finite"]
         for name, term in terms.items():
             own = self.sums.setdefault(name, np.zeros(env.num_envs))
-            own += np.where(np.isfinite(term), term, 0.0)
+            own += np.where(spoilt, 0.0, term)  # a step that the guard ends earns nothing
             held = (env.memory(f"{kind} reward {name}")[:, 0].numpy() for kind in ("last", "sum"))
             self._near(f"sum of the reward {name}", own, np.where(done, *held), SUMS * max(1.0, np.abs(own).max()))
         for name, holds in ends.items():

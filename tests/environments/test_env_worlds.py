@@ -110,7 +110,7 @@ def test_what_start_and_reset_keep_stays():
 
 def test_memories_of_other_sizes_and_of_values_are_refused():
     """Numbers beyond those of a name would be those of another one."""
-    with pytest.raises(ValueError, match=r"World.memory: 'x' has 1 numbers.*asks for 2"):
+    with pytest.raises(ValueError, match=r"World.keep\('x'\) was given a list of 2; expected one number"):
         cart_env(
             2, rewards={"a": (1.0, lambda w: w.memory("x", 1)[0]), "b": (1.0, lambda w: w.keep("x", [1.0, 2.0]) or 0.0)}
         )

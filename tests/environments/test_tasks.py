@@ -108,7 +108,7 @@ def test_a_training_resumes(trained, tmp_path):
     assert runner.current_learning_iteration == 3
     steps = {int(state["step"]) for state in runner.alg.optimizer.state_dict()["state"].values()}
     assert steps == {4 * learner.epochs * learner.batches}
-    runner = learning.train(env, learner, tmp_path, 9, resume=trained / "model_2.pt", seconds=0.0)
+    runner = learning.train(env, learner, tmp_path, 9, resume=trained / "model_2.pt", seconds=1e-9)
     assert runner.current_learning_iteration == 3 and (tmp_path / "model_3.pt").exists()  # time is over after one
     with pytest.raises(ValueError, match="has 3 iterations, and 3 are asked for in all; expected more"):
         learning.train(env, learner, tmp_path, 3, resume=trained / "model_2.pt")
