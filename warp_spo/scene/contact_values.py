@@ -89,8 +89,8 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
         if d is None:
             shared = max(rests, min(BODIES_AT_REST, len(set(bodies[tree[bodies]]))) * min(len(own), POINTS_AT_REST))
             d = DAMPING * np.sqrt(k * mass / shared)
-        found = contact.friction, k, d, contact.torsional_friction, contact.rolling_friction
-        for name, value in zip(CONTACT_VALUES, found, strict=True):
+        mine = contact.friction, k, d, contact.torsional_friction, contact.rolling_friction
+        for name, value in zip(CONTACT_VALUES, mine, strict=True):
             values[name][0, i] = value
     return {name: read_only(value) for name, value in values.items()}
 
