@@ -5,6 +5,7 @@ import functools
 import mujoco
 import numpy as np
 import pytest
+import warp as wp
 
 import warp_spo as spo
 from support import contact_gradients
@@ -198,8 +199,10 @@ def test_limbs_of_other_coefficients(dtype, device):
         return
     names = ("contact_torsional_friction", "contact_rolling_friction")
     dyn = spo.Dynamics(scene, 6, device, dtype, granularity="segment", variable=names)
-    given = [torch.tensor(x, device=device) for x in a]
-    values = {name: torch.tensor(np.tile(scene.values[name], (6, 1)), device=device) for name in names}
+    given = [torch.tensor(x, device=wp.device_to_torch(device)) for x in a]
+    values = {
+        name: torch.tensor(np.tile(scene.values[name], (6, 1)), device=wp.device_to_torch(device)) for name in names
+    }
 
     def loss(values):
         dyn.set(**values)
