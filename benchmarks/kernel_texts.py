@@ -32,6 +32,7 @@ from warp_spo.examples import biped, fivebar, fourbar, slider_crank, stewart
 from warp_spo.execution.device_facts import MEASURED
 from warp_spo.kernels import native
 from warp_spo.runtime import launches
+from warp_spo.scene.contact_values import TURNING_VALUES
 
 from .contact import scenes
 from .table import robots, shapes
@@ -193,6 +194,8 @@ def _is_there(name: str, scene: spo.Scene) -> bool:
     """Return whether the scene has what a result of its contacts is about."""
     if name == "contact_residual":
         return bool(scene.contact_pairs)
+    if name == "contact_moment":
+        return any(scene.values[friction].any() for friction in TURNING_VALUES)
     return not name.startswith("contact_") or bool(scene.contacts)
 
 

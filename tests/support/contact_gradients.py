@@ -16,6 +16,7 @@ from warp_spo.recursions.model.links import Links
 from warp_spo.recursions.model.messages import SIZES
 from warp_spo.recursions.model.tracing import Trace
 from warp_spo.recursions.step.step import GAIN
+from warp_spo.scene.contact_values import TURNING_VALUES
 from warp_spo.trace.evaluation import evaluate
 from warp_spo.trace.scalars import ordered
 
@@ -31,15 +32,20 @@ FOURTH = ((1.0, 8.0), (-1.0, -8.0), (2.0, -1.0), (-2.0, 1.0))
 """How far each copy moves, and its weight in twelve steps of the difference, which is of fourth order."""
 
 
+def variable(scene):
+    """Names of the values by which there are gradients: of torsional and rolling friction where the scene has some."""
+    return (*VALUES, *(name for name in TURNING_VALUES if scene.values[name].any()))
+
+
 def furnish(scene, a):
     """The arguments and the values of a scene by name, [world, ...]."""
     worlds = len(a["q"])
-    values = {name: scene.values[name] for name in VALUES if scene.values[name].size}
+    values = {name: scene.values[name] for name in variable(scene) if scene.values[name].size}
     return a | {name: np.tile(value, (worlds, *[1] * (value.ndim - 1))) for name, value in values.items()}
 
 
 def trace_of(scene, names):
-    return Trace(Links(scene, VALUES), "float64", names)
+    return Trace(Links(scene, variable(scene)), "float64", names)
 
 
 def store(stores, known, found):
@@ -60,7 +66,7 @@ def cells_of(known):
 
 def step(scene, a, h, passes):
     """q', qd' [world, ...] and the answers of all comparisons on the way [world, comparison]."""
-    arguments = tuple(name for name in a if name not in VALUES)
+    arguments = tuple(name for name in a if name not in (*VALUES, *TURNING_VALUES))
     trace, worlds = trace_of(scene, (*arguments, "dt", "passes")), len(a["q"])
     phases = contact_step.step(trace)
     stores = phases.stores
@@ -84,10 +90,14 @@ def gradient(scene, a, h, passes, cotangents, wrt, ran=None):
 
     ``ran`` receives, for each launch, the kernel's name, what it reads and what it leaves.
     """
-    arguments, worlds, dofs = tuple(name for name in a if name not in VALUES), len(a["q"]), scene.dof_count
+    arguments, worlds, dofs = (
+        tuple(name for name in a if name not in (*VALUES, *TURNING_VALUES)),
+        len(a["q"]),
+        scene.dof_count,
+    )
     names = (*arguments, "dt", "passes", "number")
     laws = contact_pass.count_laws(trace_of(scene, names))
-    count = contact_pass.count_variables(Links(scene, VALUES), laws)
+    count = contact_pass.count_variables(Links(scene, variable(scene)), laws)
     weighed = SIZES["P"] * len(contact_pass.weighed_segments(trace_of(scene, names)))
     back_names = (*names, "qdd", "solved", "q_cotangent", "qd_cotangent")
     kernels = {

@@ -20,6 +20,15 @@ def by_point(at, forces):
     return force, gap
 
 
+def with_turning(scene, seed=0, torsional=0.02, rolling=0.01):
+    """The scene with torsional and rolling friction, of each point another one, and one point without any."""
+    rng, count = np.random.default_rng(seed), len(scene.contact_points)
+    both = {"torsional": torsional * rng.uniform(0.5, 2.0, count), "rolling": rolling * rng.uniform(0.5, 2.0, count)}
+    for values in both.values():
+        values[-1] = 0.0
+    return scene.with_values(**{f"contact_{name}_friction": values for name, values in both.items()})
+
+
 def assert_is_dense(scene, a, passes):
     """The recursion, evaluated without compiling, is the dense step in every world."""
     compute = symbolic.contact_step if passes < MIDPOINT_PASSES else symbolic.midpoint_contact_step
@@ -32,6 +41,8 @@ def assert_is_dense(scene, a, passes):
         np.testing.assert_allclose(found["q_out"][w], q, atol=1e-10)
         force, gap = by_point(at, wanted.f)
         np.testing.assert_allclose(found["contact_f"][w], force, atol=1e-10 * max(1.0, np.abs(wanted.f).max()))
+        moment, _ = by_point(at, wanted.moment)
+        np.testing.assert_allclose(found["contact_moment"][w], moment, atol=1e-10 * max(1.0, np.abs(wanted.f).max()))
         np.testing.assert_allclose(found["contact_gap"][w], gap, atol=1e-12 if passes < MIDPOINT_PASSES else PARABOLA)
         np.testing.assert_allclose(found["contact_excess"][w], wanted.excess, atol=1e-9 * np.abs(wanted.f).max() + 1e-9)
 

@@ -137,7 +137,8 @@ def contact_step(scene, arrays, h, passes=3, dtype="float64"):
         known |= stored(looped, {name: known[name].copy() for name in (GAIN, SECANT)})
     points, n = len(scene.contact_points), scene.dof_count
     shapes = {"out": (n,), "q_out": (scene.coord_count,), "qdd_out": (n,), "status": (), "contact_f": (points, 3),
-              "contact_gap": (points,), "contact_slip": (points,), "contact_excess": (3,)}  # fmt: skip
+              "contact_gap": (points,), "contact_slip": (points,), "contact_excess": (3,),
+              "contact_moment": (points, 3)}  # fmt: skip
     last = [item for item in stores if item.array not in (GAIN, SECANT)]
     return stored(last, {name: np.full((worlds, *shape), np.nan) for name, shape in shapes.items()})
 

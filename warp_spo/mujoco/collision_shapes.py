@@ -11,6 +11,7 @@ import numpy as np
 
 from ..scene.collision_shapes import CollisionShape
 from ..scene.contact_shapes import SHAPES, kinds_in
+from ..scene.contacts import FRICTIONS
 from ..scene.ground import HeightField
 from .mechanism import xyzw
 from .source import Source
@@ -30,7 +31,8 @@ def collision_shapes(source: Source, moving: np.ndarray) -> list[CollisionShape]
     ``moving`` says which bodies of the scene can move, bool [body]; body k of it is body k + 1 of the model.
 
     A shape that moves has the friction that it has on the model's ground, if there is one: by the rule of MuJoCo for
-    priorities, and zero where the contact has one dimension. Its rounding is the margin of the contact, the sum of both
+    priorities, and zero where the contact has one dimension. Torsional friction takes four dimensions (``condim``),
+    rolling friction six. Its rounding is the margin of the contact, the sum of both
     geoms' or that of their pair, because MuJoCo pushes two surfaces apart until they are so far from each other.
     """
     m = source.model
@@ -48,8 +50,9 @@ def collision_shapes(source: Source, moving: np.ndarray) -> list[CollisionShape]
             found.append(_shape(source, geom, None, 0.0))
             continue
         ground = touched[0] if touched else None
-        shape = _shape(source, geom, _friction(source, geom, ground, pairs), _margin(source, geom, ground, pairs))
-        found.append(dataclasses.replace(shape, unread=_unread_softness(source, geom, ground, pairs)))
+        shape = _shape(source, geom, None, _margin(source, geom, ground, pairs))
+        material = _frictions(source, geom, ground, pairs)
+        found.append(dataclasses.replace(shape, **material, unread=_unread_softness(source, geom, ground, pairs)))
     return found
 
 
@@ -102,21 +105,24 @@ def touching_bodies(source: Source, moving: np.ndarray) -> tuple[int, int] | Non
     return None
 
 
-def _friction(source: Source, geom: int, ground: int | None, pairs: Pairs) -> float:
-    """Return the sliding friction of a geom on a ground, its own without one."""
+def _frictions(source: Source, geom: int, ground: int | None, pairs: Pairs) -> dict[str, float]:
+    """Return sliding, torsional and rolling friction of a geom on a ground, its own without one."""
     m = source.model
     pair = None if ground is None else pairs.get(frozenset((geom, ground)))
     if pair is not None:
-        (value, across), dimensions = m.pair_friction[pair, :2], m.pair_dim[pair]
-        if dimensions > 1 and across != value:
-            words = f"the friction {across:g} across of a contact pair of {source.words('geom', geom)}"
-            source.left_out.append(f"{words}, which has {value:g} in all directions")
+        (slide, across, torsional, roll, roll_across), dimensions = m.pair_friction[pair], m.pair_dim[pair]
+        for least, word, value, other in ((3, "friction", slide, across), (6, "rolling friction", roll, roll_across)):
+            if dimensions >= least and other != value:
+                words = f"the {word} {other:g} across of a contact pair of {source.words('geom', geom)}"
+                source.left_out.append(f"{words}, which has {value:g} in all directions")
+        values = slide, torsional, roll
     else:
         both = _counting(m, geom, ground)
-        value, dimensions = (max(values[g] for g in both) for values in (m.geom_friction[:, 0], m.geom_condim))
+        values, dimensions = m.geom_friction[both].max(axis=0), m.geom_condim[both].max()
     if source.enabled("OVERRIDE"):
-        value = m.opt.o_friction[0]
-    return float(value) if dimensions > 1 else 0.0
+        values = m.opt.o_friction[[0, 2, 3]]
+    leasts = zip(FRICTIONS, values, (3, 4, 6), strict=True)
+    return {name: float(value) if dimensions >= least else 0.0 for name, value, least in leasts}
 
 
 def _counting(m: Any, geom: int, ground: int | None) -> list[int]:

@@ -18,7 +18,7 @@ from ..scene.ground import HEIGHTS
 from ..scene.scene import Scene
 from ..status import Status
 from .elevations import Elevations
-from .model_contacts import CONTACT_MATERIALS, ModelContacts, model_contacts
+from .model_contacts import CONTACT_MATERIALS, ModelContacts, model_contacts, turns
 from .pairs import ModelPairs, refuse_still
 from .slots import ContactSlots
 from .worlds import WorldRows, to_numpy
@@ -75,6 +75,21 @@ def find_contacts(
     except UnsupportedError as error:
         warn_of_contacts_left_out(model, str(error))
         return None
+
+
+def warn_of_turning_left_out(
+    model: newton.Model, touching: ModelContacts | ContactSlots | None, pairs: ModelPairs | None
+) -> None:
+    """Warn if a model has torsional or rolling friction that contacts of a list, or pairs of bodies, do not have."""
+    both = ("contacts of a list", isinstance(touching, ContactSlots)), ("pairs of bodies", pairs is not None)
+    kinds = [words for words, there in both if there]
+    if kinds and turns(model):
+        warnings.warn(
+            f"SolverSPO: {' and '.join(kinds)} have no torsional and no rolling friction, which shapes of the model "
+            "ask for by a condim of 4 or 6; contacts with the ground have both where contacts='ground' takes them",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def warn_of_contacts_left_out(model: newton.Model, why: str, depth: int = 6) -> None:

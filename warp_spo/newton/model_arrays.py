@@ -15,6 +15,7 @@ from ..scene.parts import DOF_VALUES
 from .contacts import VALUES, Materials
 from .elevations import Elevations
 from .layout import FlatLayout, StateLayouts, lay_out
+from .model_contacts import TURNING_MATERIALS, turns
 from .worlds import WorldRows, to_numpy
 
 FORCE_VALUES = tuple(name for name in DOF_VALUES if name != "joint_armature")
@@ -32,7 +33,8 @@ FLAGS = {
 WATCHED = tuple(dict.fromkeys(name for names in FLAGS.values() for name in names))
 SHAPES = (*VALUES, *(f"shape_{name}" for name in ("transform", "scale", "margin", "flags", "collision_group")))
 """Arrays of shapes, on which steps of a solver depend that computes contacts."""
-SHAPE_FLAGS = {ModelFlags.SHAPE_PROPERTIES: SHAPES}
+TURNING = tuple(f"shape_material_{name}" for name, _ in TURNING_MATERIALS.values())
+"""The same where shapes have torsional or rolling friction."""
 
 
 class ModelArrays:
@@ -62,8 +64,10 @@ class ModelArrays:
     ):
         self.model, self._factors, self._sources = model, factors, sources
         self._layouts = _layouts_of_values(model, worlds, state)
-        self.flags: Mapping[ModelFlags, Sequence[str]] = {**FLAGS, **SHAPE_FLAGS} if sources else FLAGS
-        watched = (*WATCHED, *SHAPES) if sources else WATCHED
+        shapes = (*SHAPES, *TURNING) if turns(model) else SHAPES
+        shape_flags = {ModelFlags.SHAPE_PROPERTIES: shapes}
+        self.flags: Mapping[ModelFlags, Sequence[str]] = {**FLAGS, **shape_flags} if sources else FLAGS
+        watched = (*WATCHED, *shapes) if sources else WATCHED
         self.used = {name: wp.clone(getattr(model, name)) for name in watched}
         self.stamp = 0
 

@@ -28,6 +28,8 @@ KINDS = {
 }
 CONTACT_MATERIALS = {"contact_friction": "mu", "contact_stiffness": "ke", "contact_damping": "kd"}
 """Materials of shapes by the values of a scene that they are."""
+TURNING_MATERIALS = {"contact_torsional_friction": ("mu_torsional", 4), "contact_rolling_friction": ("mu_rolling", 6)}
+"""The same of friction against turning, and the least dimensions (``condim``) of a contact that has it."""
 
 
 class ModelShapes:
@@ -126,6 +128,11 @@ class ModelShapes:
     def material(self, name: str, rows: Any) -> np.ndarray:
         """Return "mu", "ke" or "kd" of shapes, float64."""
         return to_numpy(self.model, f"shape_material_{name}")[rows].astype(np.float64)
+
+    def dimensions(self, rows: Any) -> np.ndarray:
+        """Return the dimensions of contacts of shapes, SolverMuJoCo's ``condim``; three where none are given."""
+        given = _condim(self.model)
+        return np.full(np.shape(rows), 3) if given is None else given[rows]
 
     def rows_of(self, shape: CollisionShape) -> np.ndarray:
         """Return the index of a shape of world 0, or outside of all worlds, in each world [world]."""
@@ -245,12 +252,21 @@ def model_contacts(
         ground, values = shapes.grounds(selected.ground_shape, ground, apart)
     scene = scene.with_contacts([one for _, made in selected.contacts_by_shape for one in made], ground)
     made = ModelContacts(scene, shapes, selected)
-    for name, key in CONTACT_MATERIALS.items():
-        own = shapes.material(key, made.point_rows)
-        if made.ground_rows is not None:
-            own = 0.5 * (own + shapes.material(key, made.ground_rows)[:, None])
-        values[name] = own
+    points, grounds = made.point_rows, made.ground_rows
+
+    def mean(key: str) -> np.ndarray:
+        own = shapes.material(key, points)
+        return own if grounds is None else 0.5 * (own + shapes.material(key, grounds)[:, None])
+
+    values |= {name: mean(key) for name, key in CONTACT_MATERIALS.items()}
+    dimensions = shapes.dimensions(points)
+    if grounds is not None:
+        dimensions = np.maximum(dimensions, shapes.dimensions(grounds)[:, None])
     values = {name: array for name, array in values.items() if (array != array[:1]).any()}
+    for name, (key, least) in TURNING_MATERIALS.items():
+        turning = np.where(dimensions >= least, mean(key), 0.0)
+        if turning.any():
+            values[name] = turning[:1] if (turning == turning[:1]).all() else turning
     return made._replace(scene=scene.with_values(**values))
 
 
@@ -262,6 +278,18 @@ def with_model_contacts(model: newton.Model, worlds: WorldRows, scene: Scene, se
     if made.selected.left_out:
         warnings.warn(f"from_newton: left out: {', '.join(made.selected.left_out)}", UserWarning, stacklevel=3)
     return made.scene
+
+
+def turns(model: newton.Model) -> bool:
+    """Return whether some shape of a model asks for torsional or rolling friction."""
+    given = _condim(model)
+    return given is not None and bool((given > 3).any())
+
+
+def _condim(model: newton.Model) -> np.ndarray | None:
+    """Return MuJoCo's dimensions of contacts by shape, a custom attribute of a model; None where it has none."""
+    given = getattr(getattr(model, "mujoco", None), "condim", None)
+    return None if given is None else given.numpy()
 
 
 def _triangles(mesh: Any) -> np.ndarray:

@@ -22,7 +22,16 @@ from ..runtime import launches
 from ..scene.collision_shapes import POINTS
 from ..scene.scene import Scene
 from .body_states import BodyStates
-from .contacts import ELEVATIONS, MODES, VALUES, StatusWords, find_contacts, sources_of, warn_of_contacts_left_out
+from .contacts import (
+    ELEVATIONS,
+    MODES,
+    VALUES,
+    StatusWords,
+    find_contacts,
+    sources_of,
+    warn_of_contacts_left_out,
+    warn_of_turning_left_out,
+)
 from .drives import GAINS, Drives
 from .joint_forces import JointForces
 from .layout import StateLayouts
@@ -175,6 +184,7 @@ class SolverSPO(MassMatrixInterface, SolverBase):
         with paused_tape():
             made = self._build()
         warn_of_soft_shapes(model, points, *made)
+        warn_of_turning_left_out(model, *made[2:])
 
     def _build(self) -> tuple[WorldRows, Scene, ModelContacts | ContactSlots | None, ModelPairs | None]:
         """Compile and allocate everything for the model as it is now; return its rows, scene and contacts."""

@@ -40,6 +40,7 @@ class PairStep(ContactStep):
         n = dense.dof_count
         shapes = ((-1, 3, n), (-1, 3), *[(-1,)] * 6)
         found = Points(*(np.reshape([row[i] for row in rows], s) for i, s in enumerate(shapes)), np.zeros(len(rows)))
+        found = found.that_turn_freely()
         return found if ground is None else Points(*(np.concatenate(both) for both in zip(ground, found, strict=True)))
 
     def reports(self, found):

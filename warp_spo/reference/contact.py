@@ -4,10 +4,11 @@ A contact is a spring, a damper and friction between a point of a body and the g
 f = f0 - G J v, with the velocity v = qd' after the step, a positive semidefinite G [3, 3] and the spring's load f0
 along the normal n, both of which see the point's path bend as its links turn. A step solves, with the pose held,
 
-    (Mass + h S + h J* G J) v = Mass qd + h (tau - bias + l + J* f0),
+    (Mass + h S + h J* G J + h R* B R) v = Mass qd + h (tau - bias + l + J* f0),
 
-where S and l are resistances and loads of the hinges' laws. G, S and l depend on v; each pass takes them from the v of
-the pass before. Friction, effort limits and dry friction are secants: dampers that give the bound at the v before. The
+where S and l are resistances and loads of the hinges' laws, and -B R v is the moment of torsional and rolling friction
+on the body that turns with R v. G, B, S and l depend on v; each pass takes them from the v of the pass before.
+Friction, effort limits and dry friction are secants: dampers that give the bound at the v before. The
 first pass closes all candidates, later passes open those that pull, the last of three or more only closes.
 
 A step of four passes or more takes two iterations of as many passes. Each finds the kick k = -h Mass^-1 c(u, v) / 2
@@ -31,6 +32,7 @@ HOLD = 300.0  # resistance of a velocity limit, in inertias over the step
 MIDPOINT_PASSES = 4  # passes from which on a step uses the midpoint scheme
 ITERATIONS = 2  # of as many passes each
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
+LENGTH, LEAST_LENGTH = 0.1, 3e-5  # of a body that cannot turn, or whose point cannot move; what is too short to be one
 
 
 class Points(NamedTuple):
@@ -39,6 +41,10 @@ class Points(NamedTuple):
     ``depth`` is the penetration [m], ``weight`` 0.6 of the inverse weight at the neutral pose [1/kg]. ``bend`` is
     n* J' qd, the acceleration along the normal at rates that stay as they are [m/s^2]: after the step the point is
     h n* J v + h^2 bend / 2 further out, and leaves the ground at n* J v + h bend.
+
+    ``R`` [point, 3, dof] gives how the point's body turns. Columns of ``turning`` [point, 4] are the coefficients of
+    torsional and rolling friction [m], the length [m] over which eps is the rate below which they are dampers, and 0.6
+    of the inverse weight of turning at the neutral pose [1/(kg m^2)].
     """
 
     J: np.ndarray
@@ -50,6 +56,12 @@ class Points(NamedTuple):
     eps: np.ndarray
     weight: np.ndarray
     bend: np.ndarray | float = 0.0
+    R: np.ndarray | None = None
+    turning: np.ndarray | None = None
+
+    def that_turn_freely(self):
+        """Return the points without torsional and rolling friction."""
+        return self._replace(R=np.zeros_like(self.J), turning=np.tile([0.0, 0.0, 1.0, 0.0], (len(self.k), 1)))
 
     def after(self, at, h):
         """Return the depths after the step, for the velocities ``at``."""
@@ -89,12 +101,16 @@ class Laws(NamedTuple):
 
 
 class PassResult(NamedTuple):
-    """After the last pass: v [dof]; f [point, 3]; excess of cone, adhesion [N] and effort; what was closed."""
+    """After the last pass: v [dof]; f, moment [point, 3]; excess of cone, adhesion [N] and effort; what was closed.
+
+    A moment beyond its bound counts in the excess of cones over the point's length.
+    """
 
     v: np.ndarray
     f: np.ndarray
     excess: np.ndarray
     on: np.ndarray
+    moment: np.ndarray
 
 
 def solve(M, laws, limits, points, v, load, h, passes=3, gravity=0.0, outward=None):
@@ -103,10 +119,11 @@ def solve(M, laws, limits, points, v, load, h, passes=3, gravity=0.0, outward=No
     ``outward`` by dof: the dofs that it carries, [dof] of bool; of these dofs weights come from each pass's sweep.
     """
     start, kd = v, points.k * h + points.d
+    points = points if points.R is not None else points.that_turn_freely()
     at, still = points.J @ v, np.zeros_like(points.n)
     candidate = np.maximum(points.after(at, h), points.after(still, h)) + 0.5 * gravity * h * h > 0.0
     fn = candidate * np.maximum(0.0, points.push(at, h))
-    w = _slip(points.n, at)
+    w, turn = _slip(points.n, at), _turns(points, v)
     drive_s, dry_w = laws.s, np.abs(v)
     on = limit_on = None
     for number in range(passes):
@@ -122,7 +139,7 @@ def solve(M, laws, limits, points, v, load, h, passes=3, gravity=0.0, outward=No
         if last:
             closed, by_rule = closed | on, limit_on & ~held
         on, limit_on = closed, held | by_rule
-        G = dampers(points, on, kd, fn, w)
+        G, (B, turners) = dampers(points, on, kd, fn, w), turn_dampers(points, fn, turn)
         f0 = (on * points.push(still, h))[:, None] * points.n
         S, l = laws.resistance.copy(), laws.load.copy()
         S, l = S + drive_s, l + drive_s * laws.a
@@ -134,11 +151,15 @@ def solve(M, laws, limits, points, v, load, h, passes=3, gravity=0.0, outward=No
         fast = np.abs(v) > laws.fastest
         S, l = S + fast * laws.brake, l + fast * laws.brake * np.sign(v) * np.where(fast, laws.fastest, 0.0)
         A = M + h * np.diag(S) + h * np.einsum("pai,pab,pbj->ij", points.J, G, points.J)
+        A = A + h * np.einsum("pai,pab,pbj->ij", points.R, B, points.R)
         v = np.linalg.solve(A, M @ start + h * (load + l + np.einsum("pai,pa->i", points.J, f0)))
         at = points.J @ v
         f = f0 - np.einsum("pab,pb->pa", G, at)
         fn, ft = np.maximum(0.0, _along(points.n, f)), _slip(points.n, f)
         w = _slip(points.n, at) + h * points.weight * np.maximum(0.0, ft - points.mu * fn)
+        turn, moment = _turns(points, v), -np.einsum("pab,pb->pa", B, points.R @ v)
+        twisted = np.maximum(0.0, turners * turn - points.turning[:, :2] * fn[:, None])
+        turn = turn + h * points.turning[:, 3:] * twisted
         force = drive_s * (laws.a - v)
         beyond = np.maximum(0.0, np.abs(force) - laws.effort)
         felt = laws, laws
@@ -147,8 +168,9 @@ def solve(M, laws, limits, points, v, load, h, passes=3, gravity=0.0, outward=No
         drive_s = clamped(felt[0], v, force, h)
         dry_w = np.abs(v) + h * felt[1].weight * np.maximum(0.0, dry_s * np.abs(v) - laws.dry)
     cone, adhesion = ft - points.mu * fn, -_along(points.n, f)
+    cone = np.append(cone, twisted / points.turning[:, 2:3])
     excess = np.array([np.maximum(x, 0.0).max(initial=0.0) for x in (cone, adhesion, beyond)])
-    return PassResult(v, f, excess, on)
+    return PassResult(v, f, excess, on, moment)
 
 
 def felt_weights(A, outward, own, weight):
@@ -168,6 +190,20 @@ def dampers(points, on, kd, fn, w):
     across = points.mu * fn / np.sqrt(w**2 + points.eps**2)
     nn = points.n[:, :, None] * points.n[:, None, :]
     return across[:, None, None] * (np.eye(3) - nn) + (on * kd)[:, None, None] * nn
+
+
+def turn_dampers(points, fn, w):
+    """Return B [point, 3, 3], and its resistances along n and across it [point, 2], for the rates ``w`` [point, 2]."""
+    mu, slow = points.turning[:, :2], points.eps / points.turning[:, 2]
+    found = mu * fn[:, None] / np.sqrt(w**2 + slow[:, None] ** 2)
+    nn = points.n[:, :, None] * points.n[:, None, :]
+    return found[:, :1, None] * nn + found[:, 1:, None] * (np.eye(3) - nn), found
+
+
+def _turns(points, v):
+    """Return the rates at which the points' bodies spin about n and roll across it [point, 2]."""
+    turning = points.R @ v
+    return np.stack([np.abs(_along(points.n, turning)), _slip(points.n, turning)], axis=1)
 
 
 def clamped(laws, v, force, h):
@@ -303,24 +339,28 @@ class ContactStep:
         inverse = np.linalg.pinv(self.neutral.mass_matrix)
         for number, point in enumerate(self.scene.contact_points):
             at = (dense.body_matrix[point.body] @ homogeneous([*point.position, 0, 0, 0, 1]))[:3, 3]
-            turning = dense.jacobian_bias(path, [(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
+            bending = dense.jacobian_bias(path, [(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
             share = 0.5 if self.half_way else 1.0
             moves = share * self.h * dense.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3] @ path
             at = at - point.radius * np.array(ground.normal if plane else (0.0, 0.0, 1.0))
-            there = self.neutral.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
-            weight = SLIP * np.trace(there @ inverse @ there.T) / 3.0
+            there = self.neutral.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0]
+            weight, turn_weight = (SLIP * np.trace(part @ inverse @ part.T) / 3.0 for part in (there[:3], there[3:]))
+            moves_and_turns = min(weight, turn_weight) > 0.0 and weight / turn_weight > LEAST_LENGTH**2
+            length = np.sqrt(weight / turn_weight) if moves_and_turns else LENGTH
             k, d, mu = (dense.value(f"contact_{name}")[number] for name in ("stiffness", "damping", "friction"))
+            turning = [dense.value(f"contact_{name}_friction")[number] for name in ("torsional", "rolling")]
+            turning += [length, turn_weight]
             if plane:
                 touched = [(np.array(ground.normal), ground.height - (at - moved) @ ground.normal)]
             else:
                 touched = surfaces(ground, at - moved, int(field[0]) if len(field) else 0, moves, point.walls)
             for normal, depth in touched:
-                J, bend = dense._jacobian_at(point.body, at)[:3], normal @ turning
+                J, bend = dense._jacobian_at(point.body, at), normal @ bending
                 if self.half_way:  # half a step back
-                    depth = depth + 0.5 * self.h * normal @ J @ path - 0.125 * self.h**2 * bend
+                    depth = depth + 0.5 * self.h * normal @ J[:3] @ path - 0.125 * self.h**2 * bend
                     bend = 0.0
                 damping = d * k * max(depth, 0.0) if point.dissipates else d
-                rows.append((J, normal, depth, k, damping, mu, point.eps, weight, bend))
+                rows.append((J[:3], normal, depth, k, damping, mu, point.eps, weight, bend, J[3:], turning))
                 self.numbers.append(number)
         return Points(*(np.array(column) for column in zip(*rows, strict=True)))
 

@@ -18,7 +18,7 @@ import numpy as np
 from ..errors import UnsupportedError, as_integer, quoted
 from .contact_shapes import SHAPES, ContactShape, Placement
 from .contact_values import NeutralPose
-from .contacts import Contact
+from .contacts import FRICTIONS, Contact
 from .frames import pose_matrix
 from .ground import HeightField, Plane
 
@@ -39,7 +39,7 @@ NO_GROUND = (
     "all contacts, because there is no plane and no height field to touch (ground=spo.Plane() adds a floor; a pattern, "
     "such as contacts='*', takes the plane z = 0)"
 )
-MATERIAL = ("friction", "stiffness", "damping")
+MATERIAL = (*FRICTIONS, "stiffness", "damping")
 KINDS = tuple(kind for kind, shape in SHAPES.items() if shape.names)
 """Kinds of shapes of sources that contacts can represent."""
 
@@ -58,7 +58,8 @@ class CollisionShape:
             box and an ellipsoid half their lengths; of a hull its points [n, 3]; of a height field a
             :class:`HeightField` about the pose.
         rounding: by how much the surface lies outside of these sizes [m].
-        friction, stiffness, damping: of its material; None where the source has none.
+        friction, stiffness, damping: of its material; None where the source has none. torsional_friction,
+            rolling_friction: likewise [m].
         names: other names that patterns match, such as that of its mesh. index: its number in the source.
         triangles: of a hull that stands for a mesh with hollows, maybe: its points by number [n, 3]; None: it has none.
         unread: what of its material a contact does not take, in words; "" if there is nothing.
@@ -71,6 +72,8 @@ class CollisionShape:
     sizes: Any = ()
     rounding: float = 0.0
     friction: float | None = None
+    torsional_friction: float | None = None
+    rolling_friction: float | None = None
     stiffness: float | None = None
     damping: float | None = None
     names: tuple[str, ...] = ()
@@ -279,8 +282,7 @@ def moving_bodies(scene: Scene) -> np.ndarray:
 def contacts_of(shape: CollisionShape, most: int = POINTS) -> list[Contact]:
     """Return the contacts that stand for a shape, none for one that has no points."""
     values: dict[str, Any] = {"stiffness": shape.stiffness, "damping": shape.damping, "label": shape.label}
-    if shape.friction is not None:
-        values["friction"] = shape.friction
+    values |= {name: given for name in FRICTIONS if (given := getattr(shape, name)) is not None}
     found = shape.contact_shape(clean=True).on_ground(shape.rounding, most)
     return [Contact(shape.body, **one.arguments(), **values) for one in found]
 

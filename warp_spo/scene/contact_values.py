@@ -13,8 +13,9 @@ from .ground import AWAY, HEIGHTS, HeightField, Listed
 from .pairs import pair_values
 from .pickling import Stored
 
-CONTACT_VALUES = ("contact_friction", "contact_stiffness", "contact_damping")
-"""Names of a scene's values that come from its contacts, one entry a point."""
+TURNING_VALUES = ("contact_torsional_friction", "contact_rolling_friction")
+CONTACT_VALUES = ("contact_friction", "contact_stiffness", "contact_damping", *TURNING_VALUES)
+"""Names of a scene's values that come from its contacts, an entry for each point and, but for TURNING_VALUES, pair."""
 STATIC_SINK = 1.7e-3  # how far a robot sinks in [m] that rests on its points, where the stiffness is chosen
 POINTS_AT_REST = 4  # points at most on which a robot rests
 BODIES_AT_REST = 2  # bodies at most whose points, up to POINTS_AT_REST each, carry a robot
@@ -56,6 +57,7 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
     """
     points = scene.contact_points
     values = {name: np.zeros((1, scene.contact_count)) for name in CONTACT_VALUES}
+    values |= {name: np.zeros((1, len(points))) for name in TURNING_VALUES}
     sets = isinstance(scene.ground, HeightField) and scene.ground.heights.ndim == 3
     values |= {
         "ground_origin": np.zeros((1, 3 if scene.contact_count else 0)),
@@ -68,7 +70,7 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
     stand = NeutralPose(scene)
     for i, pair in enumerate(scene.contact_pairs, start=len(points)):
         found = pair_values(pair, scene, stand)
-        for name, value in zip(CONTACT_VALUES, found, strict=True):
+        for name, value in zip(CONTACT_VALUES, found, strict=False):
             values[name][0, i] = value
     at = np.array([stand.at(point) for point in points])
     bodies = np.array([point.body for point in points])
@@ -87,7 +89,8 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
         if d is None:
             shared = max(rests, min(BODIES_AT_REST, len(set(bodies[tree[bodies]]))) * min(len(own), POINTS_AT_REST))
             d = DAMPING * np.sqrt(k * mass / shared)
-        for name, value in zip(CONTACT_VALUES, (contact.friction, k, d), strict=True):
+        mine = contact.friction, k, d, contact.torsional_friction, contact.rolling_friction
+        for name, value in zip(CONTACT_VALUES, mine, strict=True):
             values[name][0, i] = value
     return {name: read_only(value) for name, value in values.items()}
 
@@ -114,7 +117,8 @@ def contact_figures(scene: Any) -> str:
     figures, graded = [], np.array([point.dissipates for point in points] + [False] * len(pairs))
     rows = [(name.removeprefix("contact_"), name, np.full(len(graded), True)) for name in CONTACT_VALUES[:2]]
     rows += [("damping", "contact_damping", ~graded), ("dissipation", "contact_damping", graded)]
-    for (label, name, which), unit in zip(rows, ("", " N/m", " N s/m", " s/m"), strict=True):
+    rows += [(name[8:].replace("_", " "), name, scene.values[name].any(axis=0)) for name in TURNING_VALUES]
+    for (label, name, which), unit in zip(rows, ("", " N/m", " N s/m", " s/m", " m", " m"), strict=True):
         if which.any():
             low, high = scene.values[name][:, which].min(), scene.values[name][:, which].max()
             value = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"

@@ -13,6 +13,9 @@ from .checks import checked_array, read_only
 from .contact_shapes import ARGUMENTS, SHAPES, ContactShape, ShapeArguments
 from .ground import HeightField, Listed, Plane
 
+FRICTIONS = ("friction", "torsional_friction", "rolling_friction")
+"""Arguments of a Contact that bound friction."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Contact(ShapeArguments):
@@ -34,6 +37,11 @@ class Contact(ShapeArguments):
             body may be -1, a shape that stands in the inertial frame. An index of a body: the shape of that body's one
             contact with the ground.
         friction: ratio of the largest friction force to the normal force.
+        torsional_friction: ratio of the largest moment about the normal, against spinning on a point, to the normal
+            force [m]; of a round patch that slides about its middle two thirds of friction times its radius. Not with
+            ``other``.
+        rolling_friction: ratio of the largest moment across the normal, against rolling and tipping, to the normal
+            force [m]: a sphere on a slope below atan(rolling_friction / radius) does not roll. Not with ``other``.
         stiffness: of each point [N/m]; None: so that a robot that stands on up to four points sinks by 1.7 mm, and so
             that the points of one body, if they span an area, carry the whole robot. See ``contact_points`` of
             :class:`Scene`. With ``other``, of the pair; None: the lighter of the two, with all that is connected to
@@ -45,7 +53,9 @@ class Contact(ShapeArguments):
         dissipation: in place of ``damping``, c of Hunt and Crossley [s/m]: the damping is c ``stiffness`` times the
             depth before the step, zero at the first touch. The scene's ``contact_damping`` of such points is c. Not
             with ``other``.
-        eps: speed [m/s] below which friction is a damper. A point that sticks creeps by less than that.
+        eps: speed [m/s] below which friction is a damper. A point that sticks creeps by less than that. Torsional and
+            rolling friction are dampers below eps over the length with which the point's body turns as easily as the
+            point moves in the neutral pose: 0.63 radii of a free sphere.
         walls: on a height field, cells steeper than 45 degrees are a wall and a floor for the points; False: the slopes
             that they are, where a wall matters little, for about half the operations of such a point.
         label: name in tables and errors.
@@ -56,6 +66,8 @@ class Contact(ShapeArguments):
 
     other: Any = None
     friction: float = 0.8
+    torsional_friction: float = 0.0
+    rolling_friction: float = 0.0
     stiffness: float | None = None
     damping: float | None = None
     dissipation: float | None = None
@@ -73,7 +85,7 @@ class Contact(ShapeArguments):
             raise ValueError(f"{call}: {', '.join(given) or 'no shape'} given; expected one of {', '.join(ARGUMENTS)}")
         if self.damping is not None and self.dissipation is not None:
             raise ValueError(f"{call}: damping and dissipation are given; expected one of them, or none")
-        for name in ("friction", "stiffness", "damping", "dissipation", "eps"):
+        for name in (*FRICTIONS, "stiffness", "damping", "dissipation", "eps"):
             value = getattr(self, name)
             if value is None and name in ("stiffness", "damping", "dissipation"):
                 continue

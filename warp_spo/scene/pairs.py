@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import UnsupportedError, as_integer, quoted
 from .contact_shapes import ConvexShape, as_pair, most_points
+from .contacts import FRICTIONS
 
 STATIC_SINK = 1e-4  # how far the lighter body sinks in [m] that rests on the other one, where the stiffness is chosen
 DAMPING = 2.0  # of sqrt(k m): critical, so that stacks come to rest
@@ -40,6 +41,11 @@ def contact_pairs(contacts: Sequence[Any], bodies: Sequence[Any]) -> tuple[Conta
         call = f"Scene: contact {index} {quoted(contact.label)}" if contact.label else f"Scene: contact {index}"
         if contact.dissipation is not None:
             raise UnsupportedError(call, "dissipation= of a contact between bodies", "give damping=")
+        for name in FRICTIONS[1:]:
+            if getattr(contact, name):
+                raise UnsupportedError(
+                    call, f"{name}= of a contact between bodies", "leave it out, or give more points"
+                )
         partner = _partner(call, contact, contacts)
         body, other = as_integer(contact.body), as_integer(partner.body)
         if body is None or other is None:

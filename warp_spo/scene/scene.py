@@ -103,9 +103,10 @@ class Scene(Stored):
             joint_velocity_limit. Of actuators: actuator_gain, actuator_strength, actuator_delay [actuator],
             actuator_bias [actuator, 3], actuator_ctrl_range, actuator_force_range [actuator, 2], and actuator_gear, of
             the hinges of the first actuator, of the second, and so on. Of contacts: contact_friction,
-            contact_stiffness [N/m], contact_damping [N s/m] [contact]; ground_origin [3], where the ground's own origin
-            is [m], zero at first; ground_field [1], which field of a set of height fields, the first at first;
-            ground_heights [m], the heights of a field, as they are there, shared by all worlds.
+            contact_stiffness [N/m], contact_damping [N s/m] [contact]; contact_torsional_friction,
+            contact_rolling_friction [m] [point]; ground_origin [3], where the ground's own origin is [m], zero at
+            first; ground_field [1], which field of a set of height fields, the first at first; ground_heights [m], the
+            heights of a field, as they are there, shared by all worlds.
         contact_points: the points (``ContactPoint``) of all contacts with the ground, contact after contact.
         contact_pairs: the pairs of bodies (``ContactPair``) that touch each other. Where axes of arrays say "contact",
             there is an entry for each of the points and then one for each of the pairs.

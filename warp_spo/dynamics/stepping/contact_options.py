@@ -11,6 +11,7 @@ from ...kernels import combination
 from ...recursions.contact import step as contact_step
 from ...recursions.contact.pair_pieces import by_limbs
 from ...recursions.contact.pairs import RESIDUAL, default_passes
+from ...recursions.contact.turning import turning_names
 from ...runtime.arrays import Call
 from ...scene.contact_values import contact_figures
 from ...scene.ground import HeightField
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from ..dynamics import Dynamics
 
 REPORTS = (*contact_step.REPORTS, RESIDUAL)
-AXES = ("world, contact, 3", "world, contact", "world, contact", "world, 3", "world")
+AXES = ("world, contact, 3", "world, contact", "world, contact", "world, 3", "world, contact, 3", "world")
 ARGUMENTS = tuple(
     Argument(name, axes, optional=True, asked=True, written=True) for name, axes in zip(REPORTS, AXES, strict=True)
 )
@@ -44,6 +45,10 @@ def check_step(dyn: Dynamics, call: Call, integrator: str, passes: Any, asked: d
         raise ValueError(
             f"{call.name}: {RESIDUAL} is given, and no bodies of the scene touch each other; expected None"
         )
+    if asked["contact_moment"] is not None and not turns(dyn):
+        raise ValueError(
+            f"{call.name}: contact_moment is given, and no contact has torsional or rolling friction; expected None"
+        )
     count = default_passes(dyn.scene) if passes is None else as_integer(passes)
     if count is None or count < 1:
         raise ValueError(f"{call.name}: passes is {passes!r}; expected an integer, 1 or more")
@@ -53,6 +58,12 @@ def check_step(dyn: Dynamics, call: Call, integrator: str, passes: Any, asked: d
         what = f"{' and '.join(reports)} of a scene in which nothing can move"
         raise UnsupportedError(call.name, what, "leave it out")
     return count
+
+
+def turns(dyn: Dynamics) -> bool:
+    """Return whether some contact point has torsional or rolling friction."""
+    scene, variable = dyn.scene, dyn.variable
+    return any(turning_names(scene, variable, number) for number in range(len(scene.contact_points)))
 
 
 def refuse(dyn: Dynamics, call: Call, integrator: str) -> None:

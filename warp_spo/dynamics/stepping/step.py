@@ -181,6 +181,7 @@ def _step(
     contact_gap: AnyArray | None = None,
     contact_slip: AnyArray | None = None,
     contact_excess: AnyArray | None = None,
+    contact_moment: AnyArray | None = None,
     contact_residual: AnyArray | None = None,
     out: tuple[ArrayT | None, ArrayT | None] = (None, None),
 ) -> tuple[ArrayT, ArrayT]:
@@ -190,7 +191,7 @@ def _step(
         integrators.check_integrator(call, integrator, status=status, qdd=qdd)
         outs = engine.outs(call, STEP, out)
         count = _take_substeps(call.name, {"substeps": substeps})
-        reported = contact_f, contact_gap, contact_slip, contact_excess, contact_residual
+        reported = contact_f, contact_gap, contact_slip, contact_excess, contact_moment, contact_residual
         asked = dict(zip(contact_options.REPORTS, reported, strict=True))
         taken = contact_options.check_step(self, call, integrator, passes, asked)
         actuators.check_commands(self, call, ctrl, actuator_state, target_q)
@@ -213,7 +214,7 @@ def _step(
         _launch(self, call, integrator, count, interval, given, buffers)
         if words is not None:
             found = {name.removeprefix("contact_"): array for name, array in found.items()}
-            found = {"force" if name == "f" else name: array for name, array in found.items()}
+            found = {"force" if name == "f" else name: array for name, array in found.items() if name != "moment"}
             word = Status.LOOPS if self.closed and self.embedding is None else Status.RANGE
             kinds, after = self._coordinate_kinds, {"q_after": q_out, "rates": qd_out}
             status_words.check_results(self.recursions, kinds, interval.q, words, word, **after, **found)

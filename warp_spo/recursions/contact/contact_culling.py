@@ -12,8 +12,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from ...trace.scalars import Value, absolute, branch, is_constant, less, lost, select
-from ...trace.spatial import Articulated, Twist, Vector, total
-from .law import PointState, finish_point
+from ...trace.spatial import ZERO, Articulated, Twist, Vector, total
+from .law import PointReport, PointState, finish_point
 from .points import TracedContactPoint
 from .secant_laws import PassVariables, largest
 
@@ -53,10 +53,8 @@ class CullGroup(NamedTuple):
         found = self._branch(self.has_candidates, values, [0.0] * len(values))
         return P.unpacked(found[: -len(push)]), Vector(found[-len(push) :])
 
-    def finish(
-        self, pass_variables: PassVariables, moved: Twist, h: Value
-    ) -> tuple[list[tuple[TracedContactPoint, Vector, Value]], list[Value]]:
-        """Return the points with force and slip, and the largest excesses, and keep what the next pass reads.
+    def finish(self, pass_variables: PassVariables, moved: Twist, h: Value) -> tuple[list[PointReport], list[Value]]:
+        """Return force, slip and moment of the points, and the largest excesses, and keep what the next pass reads.
 
         All but the slip is computed where a point may touch. ``moved``: rates (omega'; v') of the link in this pass.
         """
@@ -64,17 +62,21 @@ class CullGroup(NamedTuple):
         mask = self.may_touch((w, v), h)
         found = [finish_point(point, state, moved, h, pass_variables.closing) for point, state in self.points]
         has_candidates = total(one.left.candidate for one in found) + lost(self.has_candidates)
-        variables = [*(variable for _, state in self.points for variable in state), self.has_candidates]
-        left = [*(value for one in found for value in one.left), has_candidates]
+        variables = [*(variable for _, state in self.points for variable in state.values), self.has_candidates]
+        left = [*(value for one in found for value in one.left.values), has_candidates]
         results = [*(x for one in found for x in one.force)]
+        turning = any(point.turning for point, _ in self.points)
+        results += [x for one in found for x in one.moment] if turning else []
+        count = len(results)
         results += [largest(list(values)) for values in zip(*(one.excess for one in found), strict=True)]
         some = self._branch(mask, [*results, *left], [*[0.0] * len(results), *variables])
         for variable, value in zip(variables, some[len(results) :], strict=True):
             pass_variables.keep(variable, value)
-        forces = [Vector(some[3 * at : 3 * at + 3]) for at in range(len(found))]
-        points = zip(self.points, forces, found, strict=True)
-        worst = some[3 * len(found) : len(results)]
-        return [(point, force, one.slip) for (point, _), force, one in points], worst
+        vectors = [Vector(some[at : at + 3]) for at in range(0, count, 3)]
+        moments = vectors[len(found) :] if turning else [ZERO] * len(found)
+        points = zip(self.points, vectors[: len(found)], found, moments, strict=True)
+        worst = some[count : len(results)]
+        return [PointReport(point, force, one.slip, moment) for (point, _), force, one, moment in points], worst
 
     def _branch(self, mask: Value, values: list[Value], otherwise: list[Value]) -> list[Value]:
         """Return values that code computes where ``mask`` is not zero, and what they are elsewhere."""

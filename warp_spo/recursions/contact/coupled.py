@@ -205,6 +205,8 @@ class CoupledStep(ContactStepTrace):
                 if name == "contact_f":
                     force = self.frames[key(axes)][0] @ Vector(read(FIELDS * pair + c) for c in range(3))
                     stores += [Store(name, (first + pair, c), x * sign) for c, x in enumerate(force)]
+                elif name == "contact_moment":
+                    stores += [Store(name, (first + pair, c), 0.0) for c in range(3)]
                 elif name in offset:
                     stores.append(Store(name, (first + pair,), read(FIELDS * pair + offset[name])))
         return stores

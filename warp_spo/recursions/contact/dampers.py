@@ -7,12 +7,16 @@ that several points share, as all do on a plane, depends on sums of m, m r and m
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 from ...trace.scalars import Value, branch, is_constant, reciprocal
 from ...trace.spatial import Articulated, Matrix, Rigid, Vector, cross, dot, skew, total, upper
 from .points import TracedContactPoint
+from .turning import split
 
 SEVERAL = 3  # points of one normal from which sums take fewer operations
+NO_MATRIX = upper(lambda i, j: 0.0)
+T = TypeVar("T")
 
 
 def damper(points: Sequence[TracedContactPoint], across: Sequence[Value], along: Sequence[Value]) -> Articulated:
@@ -74,11 +78,20 @@ def chosen(
     return Articulated.unpacked(found[:-6]), Vector(found[-6:])
 
 
-def _by_normal(
-    points: Sequence[TracedContactPoint], values: Sequence[Value]
-) -> list[list[tuple[TracedContactPoint, Value]]]:
+def turning_damper(points: Sequence[TracedContactPoint], dampers: Sequence[Sequence[Value]]) -> Articulated | None:
+    """Return the sum of the dampers of turning of points of one link, see :mod:`.turning`; None without any."""
+    turning = [(point, split(point, own)) for point, own in zip(points, dampers, strict=True) if point.turning]
+    found = NO_MATRIX
+    for each in _by_normal(*zip(*turning, strict=True)) if turning else []:
+        n, across = each[0][0].normal, total(across for _, (_, across) in each)
+        more = total(about - across for _, (about, across) in each)
+        found = found + upper(lambda i, j: more * (n[i] * n[j]) + (across if i == j else 0.0))  # noqa: B023
+    return Articulated(found, NO_MATRIX, NO_MATRIX) if turning else None
+
+
+def _by_normal(points: Sequence[TracedContactPoint], values: Sequence[T]) -> list[list[tuple[TracedContactPoint, T]]]:
     """Return the points and their values, together those of one normal."""
-    found: dict[tuple, list[tuple[TracedContactPoint, Value]]] = {}
+    found: dict[tuple, list[tuple[TracedContactPoint, T]]] = {}
     for point, value in zip(points, values, strict=True):
         key = tuple(x if is_constant(x) else x.key for x in point.normal)
         found.setdefault(key, []).append((point, value))

@@ -11,16 +11,26 @@ from typing import NamedTuple
 from ...trace.scalars import Value, inverse_root, less, select, sqrt
 from ...trace.spatial import ZERO, Twist, Vector, dot, total
 from .points import TracedContactPoint
+from .turning import finish_turning, rates, turning_dampers
 
 TINY = 1e-24  # square of a slip [m^2/s^2] that is nothing; its derivative is still a number in float32
 
 
 class PointState(NamedTuple):
-    """Variables of a contact point between passes: friction's damper; 1 where it is closed, where it is a candidate."""
+    """Variables of a contact point between passes: friction's damper; 1 where it is closed, where it is a candidate.
+
+    ``turning``: the dampers of torsional and of rolling friction, of those that the point has.
+    """
 
     across: Value
     closed: Value
     candidate: Value
+    turning: tuple[Value, ...] = ()
+
+    @property
+    def values(self) -> tuple[Value, ...]:
+        """The variables, one after the other."""
+        return self.across, self.closed, self.candidate, *self.turning
 
 
 class PointResult(NamedTuple):
@@ -28,9 +38,10 @@ class PointResult(NamedTuple):
 
     Attributes:
         force, slip: force on it, and its speed along the ground.
-        over, pulls, lacking: by how much the force leaves the cone, how much it pulls, and the push that it lacks
-            because the pass left the point open.
+        over, pulls, lacking: by how much force or moment leaves friction's bounds, how much it pulls, and the push that
+            it lacks because the pass left the point open.
         left: what the next pass reads.
+        moment: of torsional and rolling friction on its link.
     """
 
     force: Vector
@@ -39,14 +50,24 @@ class PointResult(NamedTuple):
     pulls: Value
     lacking: Value
     left: PointState
+    moment: Vector = ZERO
 
     @property
     def excess(self) -> tuple[Value, Value, Value]:
         return self.over, self.pulls, self.lacking
 
 
-def begin_point(point: TracedContactPoint, gravity: Vector, h: Value) -> tuple[Value, Value]:
-    """Return friction's damper before the first pass, and whether the step may reach the ground."""
+class PointReport(NamedTuple):
+    """What a pass finds of a point that a step may report: force on it, its slip, and the moment on its link there."""
+
+    point: TracedContactPoint
+    force: Vector
+    slip: Value
+    moment: Vector
+
+
+def begin_point(point: TracedContactPoint, gravity: Vector, h: Value) -> PointState:
+    """Return the variables of a point before the first pass, in which candidates, which it may reach, are closed."""
     normal = dot(point.normal, point.velocity)
     squares = total(x * x for x in gravity)
     reach = (0.5 * sqrt(squares)) * (h * h)
@@ -54,7 +75,9 @@ def begin_point(point: TracedContactPoint, gravity: Vector, h: Value) -> tuple[V
     candidate = less(0.0, point.depth + falls + reach)
     push = normal_force(point, normal, h)
     fn = candidate * select(less(0.0, push), push, 0.0)
-    return friction_damper(point, fn, slip_speed(point, point.velocity, normal)), candidate
+    across = friction_damper(point, fn, slip_speed(point, point.velocity, normal))
+    turned = rates(point, point.twist[0]) if point.turning else ()
+    return PointState(across, candidate, candidate, turning_dampers(point, fn, turned))
 
 
 def slip_speed(point: TracedContactPoint, x: Vector, normal: Value) -> Value:
@@ -90,9 +113,10 @@ def finish_point(
         moved: rates (omega'; v') of its link in this pass; None: it does not move. closing: 1 before a last pass that
             only closes, else 0.
     """
-    v = point.velocity
+    v, w = point.velocity, ZERO
     if moved is not None:
-        v = point.rate(*(before + change * h for before, change in zip(point.twist, moved, strict=True)))
+        w, at_origin = (before + change * h for before, change in zip(point.twist, moved, strict=True))
+        v = point.rate(w, at_origin)
     normal = dot(point.normal, v)
     force = force_at(point, state, v, h) if moved is not None else ZERO
     push = normal_force(point, normal, h)
@@ -102,6 +126,10 @@ def finish_point(
     cone = state.across * slip - point.mu * fn
     over = select(less(0.0, cone), cone, 0.0)
     across = friction_damper(point, fn, slip + (h * point.weight) * over)
+    moment, turning = ZERO, state.turning
+    if turning:
+        moment, beyond, turning = finish_turning(point, turning, w, fn, h)
+        over = select(less(over, beyond), beyond, over)
     reached = less(0.0, point.depth - h * normal)
     candidate = select(state.candidate, state.candidate, reached)
     pushes = less(0.0, push)
@@ -109,4 +137,4 @@ def finish_point(
     closed = select(stays, 1.0, candidate * pushes)
     lacking = select(state.closed, 0.0, candidate * select(pushes, push, 0.0))
     pulls = select(less(pushed, 0.0), -pushed, 0.0)
-    return PointResult(force, slip, over, pulls, lacking, PointState(across, closed, candidate))
+    return PointResult(force, slip, over, pulls, lacking, PointState(across, closed, candidate, turning), moment)

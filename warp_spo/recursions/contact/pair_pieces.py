@@ -277,6 +277,8 @@ class PairedSegment(ContactStepTrace):
             for pair in range(len(self.members.of_pairs)):
                 if name == "contact_f":
                     stores += [Store(name, (first + pair, c), read(5 * pair + c)) for c in range(3)]
+                elif name == "contact_moment":
+                    stores += [Store(name, (first + pair, c), 0.0) for c in range(3)]
                 elif name in offset:
                     stores.append(Store(name, (first + pair,), read(5 * pair + offset[name])))
         return stores

@@ -254,6 +254,8 @@ class PairedStep(ground.ContactStepTrace):
         for pair in range(len(self.members.of_pairs)):
             if name == "contact_f":
                 stores += [Store(name, (first + pair, c), read(REPORT, 5 * pair + c)) for c in range(3)]
+            elif name == "contact_moment":
+                stores += [Store(name, (first + pair, c), 0.0) for c in range(3)]
             elif name in offset:
                 stores.append(Store(name, (first + pair,), read(REPORT, 5 * pair + offset[name])))
         return stores

@@ -22,9 +22,10 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from ...scene.contact_values import TURNING_VALUES
 from ...scene.contacts import ContactPoint
 from ...scene.ground import AWAY, HEIGHTS, PLACE, HeightField, Listed
 from ...scene.scene import Scene
@@ -40,6 +41,7 @@ from ..motion import VelocityTerms, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
 from ..step.joint_laws import is_number
 from .ground import Corners, GroundOffset, Surface, directions, lowest, surface_count, surfaces
+from .turning import TurningFriction, turning_names, turning_scales
 from .velocity_kicks import KICK, PATH
 
 if TYPE_CHECKING:
@@ -61,7 +63,7 @@ class TracedContactPoint:
         depth, push: how far below ground it would be after a step that ends with n* J v = 0, and its normal force then.
         cell: of the height field, whose heights the ground has there; None on a plane.
         near: 1 where the surface is near, else 0; None: code shall not branch.
-        lever: the arm is not longer [m].
+        lever: the arm is not longer [m]. turning: its torsional and rolling friction; None: it has neither.
     """
 
     number: int
@@ -81,6 +83,7 @@ class TracedContactPoint:
     cell: Corners | None = None
     near: Value | None = None
     lever: Value = 0.0
+    turning: TurningFriction | None = None
 
     def kept_values(self, arm: bool) -> list[Value]:
         """Return what passes keep: normal, depth, push, damping, motion of the link before; ``arm``: that, too."""
@@ -175,6 +178,7 @@ def place_points(
         at[lowest(ground)] = at[lowest(ground)] - radius
         k, d, mu = (joint_laws.value(f"contact_{name}", number) for name in ("stiffness", "damping", "friction"))
         turned = mine.axes[-len(IDENTITY) :] if oriented else []
+        turning = _turning_friction(joint_laws, number, eps)
         h, moving = joint_laws.h, mine.motion
         bend = mine.bend[1] + cross(mine.bend[0], centre)
         bend = bend if moving is None else bend + moving.whirl @ centre
@@ -193,9 +197,23 @@ def place_points(
             damping = d * (k * select(less(0.0, depth), depth, 0.0)) if point.dissipates else d
             material = k, damping, mu, eps, weight
             push = k * below if half_way else k * below - damping * faster
-            state = turned, below, push, cell, near if branches else None, lever
+            state = turned, below, push, cell, near if branches else None, lever, turning
             found.append(TracedContactPoint(number, on, arm, inward, -depth, mine.twist, *material, *state))
     return found
+
+
+def _turning_friction(joint_laws: JointLaws, number: int, eps: Value) -> TurningFriction | None:
+    """Return torsional and rolling friction of a contact point, None without."""
+    links = joint_laws.links
+    names = turning_names(links.scene, links.variable, number)
+    if not names:
+        return None
+    scale: Sequence[Value] = turning_scales(links.scene)[number]
+    if links.shared_constants is not None:
+        scale = links.shared_constants.of_point(number, "turning", scale)
+    length, weight = scale
+    torsional, rolling = (joint_laws.value(name, number) if name in names else None for name in TURNING_VALUES)
+    return TurningFriction((torsional, rolling), eps * reciprocal(length), length, weight)
 
 
 def _carry_outward(

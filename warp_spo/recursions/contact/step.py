@@ -27,10 +27,11 @@ from ..step.joint_laws import Law, add_laws
 from ..step.phases import StepPhases
 from ..step.step import GAIN, Step
 from .contact_culling import CullGroup, group_points
-from .dampers import SEVERAL, chosen, damper, load
-from .law import PointResult, PointState, begin_point, finish_point, force_at, normal_force
+from .dampers import SEVERAL, chosen, damper, load, turning_damper
+from .law import PointReport, PointResult, PointState, begin_point, finish_point, force_at, normal_force
 from .points import TracedContactPoint, ground_offset, keeps_arms, own_points, place_points
 from .secant_laws import PassVariables, SecantLaw, largest, single_dofs
+from .turning import moment_at, turning_names
 from .velocity_kicks import KICK, START
 
 if TYPE_CHECKING:
@@ -40,7 +41,8 @@ PASSES = 3  # what a step with contacts takes if the caller does not say
 TOLERANCE = 0.1  # share of the weight, or of an effort limit, by which the last pass may exceed its laws without a word
 FELT = 64.0  # roundings of a pivot; an inertia that is less of it may be rounding alone
 NOTHING, NO_PUSH = Articulated.build(lambda i, j: 0.0), Vector([0.0] * 6)  # damper and load of no point
-REPORTS = ("contact_f", "contact_gap", "contact_slip", "contact_excess")
+REPORTS = ("contact_f", "contact_gap", "contact_slip", "contact_excess", "contact_moment")
+AXES_ASKED = {"contact_f", "contact_moment"}  # reports in inertial axes
 
 
 class ContactStepTrace(Step):
@@ -76,11 +78,13 @@ class ContactStepTrace(Step):
         bias, sent_ahead = self._bias()
         points, states, candidates = [], [], []
         alone = trace.exchange.alone  # segments side by side are for GPUs, where branches cost more than they spare
-        for raw in place_points(trace, self.joint_laws, self.qd, "contact_f" in self.reports, branches=alone):
-            point, first = raw.restrict_to_near(*self._first(raw))
+        oriented = not AXES_ASKED.isdisjoint(self.reports)
+        for raw in place_points(trace, self.joint_laws, self.qd, oriented, branches=alone):
+            first = self._first(raw)
+            point, (across, candidate, *turning) = raw.restrict_to_near(first.across, first.candidate, *first.turning)
             points.append(point)
-            states.append(self._new_state(*first))
-            candidates.append(first[1])
+            states.append(self._new_state(PointState(across, candidate, candidate, tuple(turning))))
+            candidates.append(candidate)
         self._group_points(points, states, candidates)
         arms = keeps_arms(trace)
         phases.add_invariants(bias.values())
@@ -119,15 +123,15 @@ class ContactStepTrace(Step):
 
     def _forces(
         self, points: list[TracedContactPoint], states: list[PointState], alpha: dict, excess: tuple[list[Value], ...]
-    ) -> dict[int, list[tuple[TracedContactPoint, Vector, Value]]]:
-        """Return force and slip of the points by number; ``excess`` receives by how much they leave their laws."""
-        found: dict[int, list[tuple[TracedContactPoint, Vector, Value]]] = {}
+    ) -> dict[int, list[PointReport]]:
+        """Return what the points report by number; ``excess`` receives by how much they leave their laws."""
+        found: dict[int, list[PointReport]] = {}
         for point, state in zip(points, states, strict=True):
             self.trace.graph.step = f"contact {point.number}|f"
             group = self.cull_groups.get(id(point.link))
             if group is None:
                 one = self._finish(point, state, alpha)
-                some, worst = [(point, one.force, one.slip)], list(one.excess)
+                some, worst = [PointReport(point, one.force, one.slip, one.moment)], list(one.excess)
             elif state is group.points[0][1]:
                 some, worst = group.finish(self.pass_variables, alpha[id(point.link)], self.h)
             else:
@@ -217,17 +221,15 @@ class ContactStepTrace(Step):
 
     def _begin(self, point: TracedContactPoint) -> PointState:
         """Return the variables of a point."""
-        return self._new_state(*self._first(point))
+        return self._new_state(self._first(point))
 
-    def _new_state(self, across: Value, candidate: Value) -> PointState:
-        """Return variables that begin with these values; a candidate begins closed."""
-        pass_variables = self.pass_variables
-        return PointState(
-            pass_variables.variable(across), pass_variables.variable(candidate), pass_variables.variable(candidate)
-        )
+    def _new_state(self, first: PointState) -> PointState:
+        """Return variables that begin with these values."""
+        across, closed, candidate, *turning = map(self.pass_variables.variable, first.values)
+        return PointState(across, closed, candidate, tuple(turning))
 
-    def _first(self, point: TracedContactPoint) -> tuple[Value, Value]:
-        """Return friction's damper before the first pass, and whether the step may reach the ground."""
+    def _first(self, point: TracedContactPoint) -> PointState:
+        """Return the values of a point's variables before the first pass."""
         return begin_point(point, self.trace.links.gravity, self.h)
 
     def _step_terms(self, points: list[TracedContactPoint], states: list[PointState]) -> StepTerms:
@@ -258,12 +260,19 @@ class ContactStepTrace(Step):
         h, mine = self.h, [point for point, _ in pressed]
         along = [h * (state.closed * (point.k * h + point.d)) for point, state in pressed]
         P = damper(mine, [h * state.across for _, state in pressed], along)
+        turning = turning_damper(mine, [[h * x for x in state.turning] for _, state in pressed])
+        P = P if turning is None else P + turning
         if len(pressed) < SEVERAL:
             loads: dict[int, tuple[TracedContactPoint, Vector]] = {}  # by place, which a floor and its wall share
             for point, state in pressed:
                 first, load_there = loads.get(id(point.arm), (point, ZERO))
                 loads[id(point.arm)] = first, load_there + force_at(point, state, point.velocity, h)
             wrenches = [point.wrench(force) for point, force in loads.values()]
+            wrenches += [
+                Vector((*moment_at(point, state.turning, point.twist[0]), *ZERO))
+                for point, state in pressed
+                if point.turning
+            ]
             return P, Vector(total(wrench[i] for wrench in wrenches) for i in range(6))
         return P, load(mine, [state.closed * normal_force(point, 0.0, h) for point, state in pressed], P, h)
 
@@ -274,23 +283,29 @@ class ContactStepTrace(Step):
         if point.near is not None:
             mask, left = point.works(found.left.candidate), found.left
             values, name = (*found.force, *found.excess, left.across, left.closed), f"force at {point.number}"
-            *force, over, pulls, lacking, across, closed = (branch(mask, x, 0.0, name) for x in values)
-            left = PointState(across, closed, left.candidate)
-            found = PointResult(Vector(force), found.slip, over, pulls, lacking, left)
+            values = (*values, *found.moment, *left.turning) if point.turning else values
+            fx, fy, fz, over, pulls, lacking, across, closed, *more = (branch(mask, x, 0.0, name) for x in values)
+            left = PointState(across, closed, left.candidate, tuple(more[3:]))
+            found = PointResult(Vector((fx, fy, fz)), found.slip, over, pulls, lacking, left, Vector(more[:3] or ZERO))
         for name in ("across", "candidate", "closed"):
             self.pass_variables.keep(getattr(state, name), getattr(found.left, name))
+        for variable, value in zip(state.turning, found.left.turning, strict=True):
+            self.pass_variables.keep(variable, value)
         return found
 
     # -- results ---------------------------------------------------------------------------------------------------
-    def _report(self, number: int, surfaces: list[tuple[TracedContactPoint, Vector, Value]]) -> None:
+    def _report(self, number: int, surfaces: list[PointReport]) -> None:
         """Keep what the caller asks for of a point; of several surfaces the sum of forces, the gap to the nearest."""
-        point, force, slip = surfaces[0]
+        point, force, slip, moment = surfaces[0]
         gap = point.gap
-        for other, more, _ in surfaces[1:]:
-            force, gap = force + more, select(less(other.gap, gap), other.gap, gap)
+        for other, more, _, turn in surfaces[1:]:
+            force, moment, gap = force + more, moment + turn, select(less(other.gap, gap), other.gap, gap)
         if "contact_f" in self.reports:
             world = [self._last(dot(axis, force)) for axis in point.axes]
             self.finished["contact_f"] += [Store("contact_f", (number, c), x) for c, x in enumerate(world)]
+        if "contact_moment" in self.reports:
+            world = [self._last(dot(axis, moment)) for axis in point.axes]
+            self.finished["contact_moment"] += [Store("contact_moment", (number, c), x) for c, x in enumerate(world)]
         if "contact_gap" in self.reports:
             self.finished["contact_gap"].append(Store("contact_gap", (number,), gap))
         if "contact_slip" in self.reports:
@@ -367,6 +382,10 @@ class ContactStepTrace(Step):
         points += range(len(scene.contact_points), scene.contact_count)
         names = ("contact_friction", "contact_stiffness", "contact_damping")
         values = [self.joint_laws.value(name, point) for name in names for point in points]
+        turning = [
+            (number, turning_names(scene, self.trace.links.variable, number)) for number, _ in own_points(self.trace)
+        ]
+        values += [self.joint_laws.value(name, number) for number, names in turning for name in names]
         place = ground_offset(self.joint_laws)
         values += [*place.origin, place.field]
         return super()._inputs() + [value for value in values if not is_constant(value)]

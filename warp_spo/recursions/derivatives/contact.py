@@ -81,7 +81,7 @@ class PassAdjoint(OnePass):
     Attributes:
         last: 1 in the last pass, else 0. qdd: what the pass found by dof, cut from its history. gains: h qdd.
         points, touches: contact points and their variables. moving: (J qdd) of links by id.
-        loads: forces on the points, at the velocities that qdd gives.
+        loads: force on each point, and moment on its link, at the velocities that qdd gives.
         inner: P+ of the trace's links, in their parents' frames, by id. terms: what the pass adds to the links.
     """
 
@@ -103,7 +103,8 @@ class PassAdjoint(OnePass):
                     law.finish(self.gains[dof], self._step_over_inertia(law, link, done) if id(link) in done else None)
         self.moving = self._twists(self._or_input(self.qdd, "qdd"))
         touching = zip(self.points, self.states, strict=True)
-        self.loads = [self._finish(point, state, self.moving)[0] for point, state in touching]
+        found = [self._finish(point, state, self.moving) for point, state in touching]
+        self.loads = [(one.force, one.moment) for one in found]
 
     def _factors(self) -> Factors:
         """Return the factors of the pass by link; {} where no law of these links or further in asks for them."""
@@ -179,9 +180,10 @@ class PassAdjoint(OnePass):
     def _power(self, solved: dict[int, Value], pushed: Twists) -> Value:
         """Return lambda . (l - S qd') + (J lambda) . f for lambda = ``solved``, J lambda = ``pushed``."""
         power = [solved[dof] * (law.force - law.resistance * self.gains[dof]) for dof, law in self.active.items()]
-        for point, force in zip(self.points, self.loads, strict=True):
+        for point, (force, moment) in zip(self.points, self.loads, strict=True):
             if point.link is not None:
-                power.append(dot(point.rate(*pushed[id(point.link)]), force))
+                twist = pushed[id(point.link)]
+                power.append(dot(point.rate(*twist), force) + dot(twist[0], moment))
         return total(power)
 
 

@@ -1,8 +1,8 @@
 """One pass of a step with contacts as a kernel of its own, which reads what the pass before left, and what it leaves.
 
 Gradients need that of every pass. The variables of a pass lie in a row [world, variable]: first those of the hinges'
-laws, link after link, then three for each surface that a point may touch. The order is the same for the whole tree and
-for its segments.
+laws, link after link, then those of each surface that a point may touch: three, and one each of torsional and rolling
+friction. The order is the same for the whole tree and for its segments.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from ...trace.scalars import Value, cut, reciprocal, select
 from ..contact.points import TracedContactPoint, own_points, surface_numbers
 from ..contact.secant_laws import PassVariables, single_dofs
 from ..contact.step import ContactStepTrace, PointState
+from ..contact.turning import turning_names
 from ..model.links import Link, Links
 from ..step.joint_laws import LIMIT, Law
 from ..step.step import GAIN
@@ -29,7 +30,7 @@ ROW, BEFORE = "row", "qdd_before"
 """Inputs that the pass before left: variables [world, variable] and qdd [world, dof]."""
 NUMBER = "number"
 """Input that counts the passes from zero; "passes" is how many there are."""
-OF_POINT = len(PointState._fields)  # variables of a surface
+OF_POINT = len(PointState._fields) - 1  # variables of a surface, without those of turning
 
 
 class RowVariables(PassVariables):
@@ -75,7 +76,8 @@ class OnePass(ContactStepTrace):
         self.pass_variables = RowVariables(trace)
         numbers = surface_numbers(trace.links.scene, HEIGHTS in trace.links.variable)
         self.surfaces = [surface for number, _ in own_points(trace) for surface in numbers[number]]
-        self._next = iter(self.surfaces)
+        ends = list(itertools.accumulate(_surface_variables(trace.links), initial=0))
+        self._next = iter([ends[surface] for surface in self.surfaces])
         starts = itertools.accumulate(laws or (), initial=0)
         self._starts = dict(zip(map(id, trace.links.leaders), starts, strict=False))
         self._count = sum(laws or ())
@@ -116,9 +118,9 @@ class OnePass(ContactStepTrace):
         self.active |= zip(link.dofs, found, strict=True)
         return found
 
-    def _new_state(self, across: Value, candidate: Value) -> PointState:
-        self.pass_variables.places = itertools.count(self._count + OF_POINT * next(self._next))
-        return super()._new_state(across, candidate)
+    def _new_state(self, first: PointState) -> PointState:
+        self.pass_variables.places = itertools.count(self._count + next(self._next))
+        return super()._new_state(first)
 
     def _group_points(
         self, points: list[TracedContactPoint], states: list[PointState], candidates: list[Value]
@@ -156,5 +158,11 @@ def weighed_segments(trace: Trace) -> tuple[int, ...]:
 
 def count_variables(links: Links, laws: tuple[int, ...]) -> int:
     """Return how many variables a pass leaves."""
+    return sum(laws) + sum(_surface_variables(links))
+
+
+def _surface_variables(links: Links) -> list[int]:
+    """Return how many variables each surface has that a point may touch."""
     surfaces = surface_numbers(links.scene, HEIGHTS in links.variable)
-    return sum(laws) + OF_POINT * sum(map(len, surfaces))
+    counts = (OF_POINT + len(turning_names(links.scene, links.variable, i)) for i in range(len(surfaces)))
+    return [count for count, touched in zip(counts, surfaces, strict=True) for _ in touched]

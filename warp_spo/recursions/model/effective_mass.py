@@ -35,9 +35,13 @@ def masses(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return mass, np.linalg.pinv(mass)
 
 
-def inverse_weights(scene: Scene, frames: tuple[tuple[int, Any], ...]) -> np.ndarray:
-    """Return the sum of J Mass^-1 J* over three directions, of each point given by its body and place [1/kg]."""
-    J = _evaluate(scene, lambda trace: jacobian(trace, frames), (len(frames), 6, scene.dof_count))[:, :3]
+def inverse_weights(scene: Scene, frames: tuple[tuple[int, Any], ...], turning: bool = False) -> np.ndarray:
+    """Return the sum of J Mass^-1 J* over three directions, of each point given by its body and place [1/kg].
+
+    ``turning``: of the body's turning, in place of the point's motion [1/(kg m^2)].
+    """
+    rows = slice(3, 6) if turning else slice(3)
+    J = _evaluate(scene, lambda trace: jacobian(trace, frames), (len(frames), 6, scene.dof_count))[:, rows]
     return np.einsum("pai,ij,paj->p", J, masses(scene)[1], J)
 
 

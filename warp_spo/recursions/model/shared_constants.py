@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
+from ...scene.contact_values import CONTACT_VALUES
 from ...trace.scalars import Graph, Value, is_constant, number
 from ...trace.spatial import IDENTITY, Matrix, Rigid, Vector
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from .segments import Segment
 
 OF_COORDINATES = ("joint_rest_q", "neutral_q")  # values with an entry for each coordinate
-OF_POINTS = ("contact_friction", "contact_stiffness", "contact_damping")
+OF_POINTS = CONTACT_VALUES
 
 
 class SharedConstants:
