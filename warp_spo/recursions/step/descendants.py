@@ -24,6 +24,7 @@ from ..kinematics import NEUTRAL, relative_quaternion
 from ..model.links import Link, place_link
 from ..motion import STILL, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
+from .free_rotation import turn_alone, turns_alone
 from .joint_laws import DEFAULT_BOUND
 
 if TYPE_CHECKING:
@@ -101,6 +102,9 @@ def states_after(
                 plain = integrate_link(link, q, rates.__getitem__, h)
                 coordinates = [select(held, x, y) for x, y in zip(plain, coordinates, strict=True)]
                 qd_after |= {dof: select(held, rates[dof], qd_after[dof]) for dof in link.dofs}
+        elif carries and turns_alone(link, trace.links.scene):
+            coordinates, found = turn_alone(link, q, qd, rates, h)
+            qd_after |= zip(link.dofs, found, strict=True)
         else:
             coordinates = integrate_link(link, q, rates.__getitem__, h)
         q_after |= {link.coordinate + c: value for c, value in enumerate(coordinates)}
