@@ -73,6 +73,19 @@ def test_a_cube_stands():
     assert np.abs(qd).max() <= 1e-5 and not found.excess.any()
 
 
+@pytest.mark.parametrize(("given", "speeds"), [({}, (0.9, 1.0)), ({"damping": 0.0}, (5.0, 90.0))])
+def test_what_starts_deep_comes_out_slowly(given, speeds):
+    """From 0.3 m below ground, turned, at PUSH_OUT at most; as fast as the spring throws it where damping is given."""
+    scene, turn = box(**given), np.array([0.3, 0.2, 0.1, 1.0])
+    q, qd, fastest = np.array([0.0, 0.0, -0.3, *(turn / np.linalg.norm(turn))]), np.zeros(6), 0.0
+    for _ in range(20):
+        step = ContactStep(scene, q, qd, H)
+        q, found = step.run()
+        out = np.einsum("pa,pa->p", step.points.n, step.points.J @ found.v)[step.points.depth > 0.05]
+        qd, fastest = found.v, max(fastest, out.max(initial=0.0))
+    assert speeds[0] <= fastest <= speeds[1]
+
+
 def test_a_cube_creeps_where_it_sticks_and_slides_as_coulomb_says():
     """Creep eps rho / sqrt(1 - rho^2) for the share rho of friction that is used; acceleration g (sin - mu cos)."""
     speeds, found = slide(20.0, 60)

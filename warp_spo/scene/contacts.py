@@ -13,6 +13,8 @@ from .checks import checked_array, read_only
 from .contact_shapes import ARGUMENTS, SHAPES, ContactShape, ShapeArguments
 from .ground import HeightField, Listed, Plane
 
+PUSH_OUT = 1.0  # speed [m/s] at most at which a depth is undone where damping is chosen
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Contact(ShapeArguments):
@@ -95,7 +97,7 @@ class ContactPoint(NamedTuple):
         contact: index of its contact in ``Scene.contacts``. body: index of its body.
         position: of the point, or of the centre of its sphere, in the body frame [m]. radius: of the sphere, or 0 [m].
         eps: speed below which friction is a damper [m/s]. dissipates: its damping grows with the depth. walls: it sees
-            walls of a height field.
+            walls of a height field. is_slow: deep in the ground it comes out at PUSH_OUT at most.
     """
 
     contact: int
@@ -105,13 +107,21 @@ class ContactPoint(NamedTuple):
     eps: float
     dissipates: bool = False
     walls: bool = True
+    is_slow: bool = False
 
 
 def contact_points(contacts: Sequence[Contact]) -> tuple[ContactPoint, ...]:
     """Return the points of all contacts with the ground, contact after contact."""
     return tuple(
         ContactPoint(
-            index, contact.body, (x, y, z), contact.radius, contact.eps, contact.dissipation is not None, contact.walls
+            index,
+            contact.body,
+            (x, y, z),
+            contact.radius,
+            contact.eps,
+            contact.dissipation is not None,
+            contact.walls,
+            contact.damping is None and contact.dissipation is None,
         )
         for index, contact in enumerate(contacts)
         if contact.other is None
