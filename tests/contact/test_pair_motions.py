@@ -187,7 +187,7 @@ def test_drives_at_their_limit_pinch(mass):
     drive = dict(target_ke=1e4, target_kd=200.0, effort_limit=20.0)
     box, k = spo.Contact(2, box=(half, half, half)), 9.81 * mass / 1e-4
     scene = spo.Scene(
-        [spo.Body(0.1, inertia=1e-4 * np.eye(3)), spo.Body(0.1, inertia=1e-4 * np.eye(3)), spo.Body(mass, inertia=cube)],
+        [*(spo.Body(0.1, inertia=1e-4 * np.eye(3)) for _ in range(2)), spo.Body(mass, inertia=cube)],
         [*(spo.Hinge("prismatic", -1, i, axis=(0, way, 0), **drive) for i, way in ((0, 1), (1, -1))),
          spo.Hinge("free", -1, 2)],
         contacts=[spo.Contact(i, box=((0.01, 0.004, 0.01), (0, way * 0.004, 0, 0, 0, 0, 1)), other=box,

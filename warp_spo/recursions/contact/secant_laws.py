@@ -3,7 +3,8 @@
 A law whose force would exceed its bound keeps the direction of its force and loses slope: the line is scaled until it
 meets the bound. Such a secant takes energy out whatever the velocity before was, where a constant force may put energy
 in. The first pass takes it at the rate before the step, which is the rate after it where a drive at its limit holds
-something; from the full line such a drive would press too hard, then too little, and lose what it pinches. A limit is closed or open; the first pass closes those that the step may reach, the last one of three only closes.
+something; from the full line such a drive would press too hard, then too little, and lose what it pinches. A limit is
+closed or open; the first pass closes those that the step may reach, the last one of three only closes.
 """
 
 from __future__ import annotations
