@@ -36,14 +36,12 @@ class Contact(ShapeArguments):
             body may be -1, a shape that stands in the inertial frame. An index of a body: the shape of that body's one
             contact with the ground.
         friction: ratio of the largest friction force to the normal force.
-        stiffness: of each point [N/m]; None: so that a robot that stands on up to four points sinks by 1.7 mm, and so
-            that the points of one body, if they span an area, carry the whole robot. See ``contact_points`` of
-            :class:`Scene`. With ``other``, of the pair; None: the lighter of the two, with all that is connected to
-            it, sinks by 0.1 mm where it rests on the other; of bodies connected to each other, with all that they
-            carry.
-        damping: of each point [N s/m]; None: sqrt(stiffness mass) / 2, with the mass that rests on the point when the
-            robot stands on two such bodies, or on four points. With ``other``, of the pair; None: critical for that
-            mass.
+        stiffness: of each point [N/m]; None: so that the weight of the body's tree, and of all trees that pairs connect
+            with it, sinks by 0.1 mm at most on up to four points, see ``contact_points`` of :class:`Scene`. With
+            ``other``, of the pair; None: so that it sinks as far under the same load and the effort limits of
+            prismatic joints between the two.
+        damping: of each point [N s/m], with ``other`` of the pair; None: stiffness times 10 ms, and of points deep in
+            the ground so much that they come out at 1 m/s.
         dissipation: in place of ``damping``, c of Hunt and Crossley [s/m]: the damping is c ``stiffness`` times the
             depth before the step, zero at the first touch. The scene's ``contact_damping`` of such points is c. Not
             with ``other``.
@@ -61,7 +59,7 @@ class Contact(ShapeArguments):
     stiffness: float | None = None
     damping: float | None = None
     dissipation: float | None = None
-    eps: float = 1e-3
+    eps: float = 1e-4
     walls: bool = True
     label: str = ""
     shape: ContactShape = dataclasses.field(init=False, repr=False)
