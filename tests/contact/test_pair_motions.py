@@ -194,7 +194,7 @@ def test_drives_at_their_limit_pinch(mass):
                               stiffness=k, damping=0.01 * k, eps=1e-4) for i, way in ((0, 1), (1, -1))],
     )  # fmt: skip
     q, qd, target = np.array([half, half, 0, 0, 0, 0, 0, 0, 1.0]), np.zeros(8), np.zeros(9)
-    target[:2] = half - 0.008
+    target[:2], target[8] = half - 0.008, 1.0
     for _ in range(12):
         step = PairStep(scene, q, qd, 1e-2, target)
         q, found = step.run(passes=4)
