@@ -24,7 +24,7 @@ def slide(degrees, steps, **contact):
     scene = box(ground=tilted(degrees), **contact)
     half = 0.5 * np.radians(degrees)
     up, down = np.array(scene.ground.normal), np.array([np.cos(2 * half), 0.0, -np.sin(2 * half)])
-    q = np.concatenate([up * 0.0983, [0.0, np.sin(half), 0.0, np.cos(half)]])
+    q = np.concatenate([up * 0.0999, [0.0, np.sin(half), 0.0, np.cos(half)]])
     qd, found, speeds = np.zeros(6), None, []
     for _ in range(steps):
         q, found = ContactStep(scene, q, qd, H).run()
@@ -73,15 +73,28 @@ def test_a_cube_stands():
     assert np.abs(qd).max() <= 1e-5 and not found.excess.any()
 
 
+@pytest.mark.parametrize(("given", "speeds"), [({}, (0.9, 1.0)), ({"damping": 0.0}, (5.0, 90.0))])
+def test_what_starts_deep_comes_out_slowly(given, speeds):
+    """From 0.3 m below ground, turned, at PUSH_OUT at most; as fast as the spring throws it where damping is given."""
+    scene, turn = box(**given), np.array([0.3, 0.2, 0.1, 1.0])
+    q, qd, fastest = np.array([0.0, 0.0, -0.3, *(turn / np.linalg.norm(turn))]), np.zeros(6), 0.0
+    for _ in range(20):
+        step = ContactStep(scene, q, qd, H)
+        q, found = step.run()
+        out = np.einsum("pa,pa->p", step.points.n, step.points.J @ found.v)[step.points.depth > 0.05]
+        qd, fastest = found.v, max(fastest, out.max(initial=0.0))
+    assert speeds[0] <= fastest <= speeds[1]
+
+
 def test_a_cube_creeps_where_it_sticks_and_slides_as_coulomb_says():
     """Creep eps rho / sqrt(1 - rho^2) for the share rho of friction that is used; acceleration g (sin - mu cos)."""
     speeds, found = slide(20.0, 60)
     rho = np.tan(np.radians(20.0)) / 0.8
-    np.testing.assert_allclose(speeds[-1], 1e-3 * rho / np.sqrt(1.0 - rho**2), rtol=2e-2)  # still settling
+    np.testing.assert_allclose(speeds[-1], 1e-4 * rho / np.sqrt(1.0 - rho**2), rtol=2e-2)  # still settling
     assert not found.excess.any()
-    speeds, _ = slide(30.0, 60, friction=0.5)
+    speeds, _ = slide(30.0, 120, friction=0.5)  # what three passes leave falls with the square of the speed
     wanted = 9.81 * (np.sin(np.radians(30.0)) - 0.5 * np.cos(np.radians(30.0)))
-    assert abs(np.diff(speeds[40:]).mean() / H / wanted - 1.0) <= 1e-3
+    assert abs(np.diff(speeds[100:]).mean() / H / wanted - 1.0) <= 1e-3
 
 
 def test_nothing_acts_above_the_ground():

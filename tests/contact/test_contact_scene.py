@@ -43,28 +43,75 @@ def test_a_neutral_stand_is_the_dense_pose():
     np.testing.assert_allclose(found.places, dense.body_matrix, atol=1e-12)
 
 
-def test_constants_that_are_chosen():
-    """A quadruped sinks 1.7 mm on four feet; a biped of 33 kg with its centre of mass 0.69 m up stands on one foot."""
-    k, d = (quadruped().values[f"contact_{name}"][0] for name in ("stiffness", "damping"))
-    mass = quadruped().values["body_mass"].sum()
-    np.testing.assert_allclose(k, mass * 9.81 / (4 * 1.7e-3))
-    np.testing.assert_allclose(d[:4], 0.5 * np.sqrt(k[0] * mass / 4.0))
-    sole = [(x, y, 0.0) for x in (-0.05, 0.12) for y in (-0.03, 0.03)]
+def values_of(scene):
+    """Stiffness and damping of every contact."""
+    return scene.values["contact_stiffness"][0], scene.values["contact_damping"][0]
+
+
+def biped(width):
+    """33.3 kg, its centre of mass 0.69 m over two soles of four points each, this far apart across the foot [m]."""
+    sole = [(x, y, 0.0) for x in (-0.05, 0.12) for y in (-0.5 * width, 0.5 * width)]
     bodies = [spo.Body(33.3, (0, 0, 0.69)), spo.Body(0.0), spo.Body(0.0)]
     hinges = [spo.Hinge("free", -1, 0), spo.Hinge("fixed", 0, 1), spo.Hinge("fixed", 0, 2)]
-    feet = [spo.Contact(foot, point=point) for foot in (1, 2) for point in sole]
-    scene = spo.Scene(bodies, hinges, contacts=feet)
-    k, tips = scene.values["contact_stiffness"][0], 33.3 * 9.81 * 0.69
-    np.testing.assert_allclose(4 * k * 0.03**2, 1.6 * tips)
-    np.testing.assert_allclose(scene.values["contact_damping"][0], 0.5 * np.sqrt(k * 33.3 / 8.0))
+    return spo.Scene(bodies, hinges, contacts=[spo.Contact(foot, point=point) for foot in (1, 2) for point in sole])
+
+
+def test_constants_that_are_chosen():
+    """A robot sinks 0.1 mm on four points, less where its sole is narrow; damping is stiffness times 10 ms."""
+    mass = quadruped().values["body_mass"].sum()
+    for scene, wanted in ((quadruped(), mass * 9.81 / 4e-4), (biped(0.06), 33.3 * 9.81 / 4e-4),
+                          (biped(0.03), 33.3 * 9.81 / (4.0 * 0.1 * 0.015**2 / 0.69)),
+                          (biped(0.0), 33.3 * 9.81 / 4e-4)):  # fmt: skip
+        k, d = values_of(scene)
+        np.testing.assert_allclose(k, wanted)
+        np.testing.assert_allclose(d, 0.01 * k)
+    np.testing.assert_allclose(box(stiffness=1e4, friction=0.2).values["contact_damping"], 100.0)
     np.testing.assert_allclose(box(stiffness=1e4, damping=3.0, friction=0.2).values["contact_damping"], 3.0)
+
+
+@pytest.mark.parametrize(("size", "sink"), [
+    ((0.005, 0.005, 0.005), 5e-5), ((0.5, 0.5, 0.5), 1e-4), ((0.006, 0.03, 0.04), 6e-5),
+    ((0.04, 0.006, 0.03), 6e-5), ((2e-4, 0.05, 0.05), 1e-5),
+])  # fmt: skip
+def test_a_box_sinks_by_a_hundredth_of_half_its_size(size, sink):
+    """At most 0.1 mm, at least 0.01 mm, however it lies in its neutral pose."""
+    scene = spo.Scene(
+        [spo.Body(2.0, inertia=np.eye(3))], [spo.Hinge("free", -1, 0)], contacts=[spo.Contact(0, box=size)]
+    )
+    np.testing.assert_allclose(values_of(scene)[0], 2.0 * 9.81 / (4.0 * sink))
+
+
+def test_pairs_carry_what_pairs_connect():
+    """A load and what it lies on have the stiffness of both; that of what lies apart is its own, and no tree's is more
+    than 1e9 1/s^2 of its mass."""
+    bodies = [spo.Body(mass, inertia=mass * np.eye(3)) for mass in (30.0, 1.0, 2.0, 1e-6)]
+    at = [dict(body=i, box=(0.1, 0.1, 0.1)) for i in range(4)]
+    contacts = [spo.Contact(**at[1]), spo.Contact(**at[2]), spo.Contact(**at[0], other=spo.Contact(**at[1])),
+                spo.Contact(**at[0], other=spo.Contact(**at[3]))]  # fmt: skip
+    scene = spo.Scene(bodies, [spo.Hinge("free", -1, i) for i in range(4)], contacts=contacts)
+    k, d = values_of(scene)
+    load = 9.81 * (31.0 + 1e-6)
+    np.testing.assert_allclose(k, [*[load / 4e-4] * 8, *[9.81 * 2.0 / 4e-4] * 8, load / 1e-4, 1e3])
+    np.testing.assert_allclose(d, 0.01 * k)
+
+
+def test_pairs_carry_what_prismatic_joints_press():
+    """The effort limit of a finger counts, that of a lift that carries both does not."""
+    slide = dict(axis=(0, 1, 0))
+    hinges = [spo.Hinge("prismatic", -1, 0, **slide, effort_limit=500.0),
+              spo.Hinge("prismatic", 0, 1, **slide, effort_limit=20.0),
+              spo.Hinge("prismatic", 0, 2, **slide)]  # fmt: skip
+    bodies = [spo.Body(1.0, inertia=np.eye(3)) for _ in range(3)]
+    pad = dict(box=(0.1, 0.1, 0.1))
+    scene = spo.Scene(bodies, hinges, contacts=[spo.Contact(1, **pad, other=spo.Contact(2, **pad))])
+    np.testing.assert_allclose(values_of(scene)[0], (3.0 * 9.81 + 20.0) / 1e-4)
 
 
 def test_contacts_are_told_kept_and_changed():
     scene = pickle.loads(pickle.dumps(quadruped()))
     assert len(scene.contact_points) == 12 and scene.contacts[4].positions.shape == (8, 3)
     line = next(line for line in spo.Dynamics(scene, device="cpu").explain().split("\n") if "contacts" in line)
-    assert "12 points of 5 bodies with the Plane" in line and "stiffness 2.08e+04 N/m" in line
+    assert "12 points of 5 bodies with the Plane" in line and "stiffness 3.53e+05 N/m, damping 3.53e+03 N s/m" in line
     assert scene.with_values(contact_friction=np.full(12, 0.3)).values["contact_friction"][0, 3] == 0.3
     with pytest.raises(ValueError, match=r"contact_stiffness holds -1.0; expected zero or more"):
         scene.with_values(contact_stiffness=np.full(12, -1.0))
@@ -141,3 +188,39 @@ def test_too_few_numbers_for_contacts_and_controls_without_actuators_say_the_way
         ValueError, match=r"ctrl is .*\(4, 3\).*has no actuators: leave ctrl out; drives follow target_q"
     ):
         dyn.step(q, qd, None, 1e-3, ctrl=np.zeros((4, 3)))
+
+
+HEAVY = {
+    "float32": (1e18, "float32", "contact_stiffness of contact 0 'foot' of body 'cube' is 2.45e\\+22 N/m; .* float32"),
+    "float64": (
+        1e160,
+        "float64",
+        "contact_stiffness of contact 0 'foot' of body 'cube' is .* in float64; give a lighter",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", HEAVY)
+def test_values_beyond_a_dtype_are_an_error(case):
+    mass, dtype, words = HEAVY[case]
+    scene = spo.Scene([spo.Body(mass, inertia=mass * np.eye(3), label="cube")], [spo.Hinge("free", -1, 0)],
+                      contacts=[spo.Contact(0, box=(0.1, 0.1, 0.1), label="foot")])  # fmt: skip
+    with pytest.raises(ValueError, match=words):
+        spo.Dynamics(scene, device="cpu", dtype=dtype)
+
+
+def test_contacts_that_sink_far_are_said(recwarn):
+    """More than a tenth of their size under what they carry; of a pair under the lighter one's weight."""
+    box(stiffness=700.0)  # 17.5 mm on four corners of a cube of 200 mm
+    quadruped(stiffness=1e4)
+    assert not recwarn
+    with pytest.warns(UserWarning, match=r"stiffness of 1 contact\(s\) is too small: .*contact 0 of body .*: 600, "
+                                         "needs 6.1e"):  # fmt: skip
+        box(stiffness=600.0)
+    with pytest.warns(UserWarning, match="stiffness of 4 contact.*sink by more than a tenth"):
+        quadruped(stiffness=8e3)  # 4.4 mm on spheres of 40 mm
+    at = [dict(body=i, box=(0.1, 0.1, 0.1)) for i in range(2)]
+    pair = spo.Contact(**at[1], other=spo.Contact(**at[0]), stiffness=400.0)
+    with pytest.warns(UserWarning, match="contact 1 of body"):
+        spo.Scene([spo.Body(1.0, inertia=np.eye(3)), spo.Body(9.0, inertia=np.eye(3))],
+                  [spo.Hinge("free", -1, i) for i in range(2)], contacts=[spo.Contact(**at[0]), pair])  # fmt: skip

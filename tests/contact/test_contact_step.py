@@ -17,8 +17,9 @@ from warp_spo.recursions.contact import dampers, ground, law, points, secant_law
 from warp_spo.reference.contact import ContactStep
 
 WORLDS = 4
-TOLERANCE = {"float64": (1e-10, 1e-10), "float32": (1e-4, 5e-4)}
-"""Of velocities, over the largest one, and of forces, over the weight; 2e-5 and 5e-5 measured on G1 in float32."""
+TOLERANCE = {"float64": (1e-10, 1e-10), "float32": (2e-4, 5e-4)}
+"""Of velocities, over the largest one, and of forces, over the weight; in float32 1.2e-4 measured on a cube that begins
+20 mm deep in a field, 5e-5 of forces on G1."""
 SIZES = {"contact_f": (3,), "contact_gap": (), "contact_slip": ()}
 
 
@@ -202,7 +203,7 @@ def test_a_ground_that_is_not_there_is_an_error(values, words):
 
 
 BUGS = {
-    "active set": (secant_laws.SecantLaw, "finish", "bound * reciprocal(share), 1.0", "0.0, 1.0"),
+    "active set": (secant_laws.SecantLaw, "_share", "bound * reciprocal(size), 1.0", "0.0, 1.0"),
     "candidates frozen": (law, "finish_point", "select(state.candidate, state.candidate, reached)",
                           "state.candidate"),
     "dampers above ground": (law, "finish_point", "candidate * pushes", "pushes"),
@@ -281,6 +282,21 @@ def test_a_quadruped_that_lands(device, dtype, granularity):
             assert found["status"][w] == (spo.Status.CONTACT if over else spo.Status.OK)
     assert (found["status"] == spo.Status.CONTACT).any()  # of one pass
     assert all(f"contact_step  {granularity}" in line for line in dyn.programs.described())
+
+
+def test_what_starts_deep_comes_out_slowly(device):
+    """Half a metre below ground: out at 1 m/s, as the dense step says, joints below 50 rad/s, and flagged."""
+    dyn, (q, qd, tau) = dynamics(str(device), "float32", "segment"), touching(quadruped(), 3, WORLDS)
+    dyn.set(contact_friction=np.full((WORLDS, 12), 0.8, np.float32))
+    q[1:, 2] -= 0.5
+    assert_is_dense(quadruped(), {"q": q[2:], "qd": qd[2:], "tau": tau[2:]}, 3)
+    found = stepped(dyn, (q, 0.0 * qd, tau))
+    for _ in range(20):
+        assert (found["status"][1:] == spo.Status.CONTACT).all() and np.abs(found["qd"]).max() < 50.0
+        before, found = found, stepped(dyn, (found["q"], found["qd"], 0.0 * tau))
+        risen = (found["contact_gap"] - before["contact_gap"])[before["contact_gap"] < -0.05] / H
+        assert 0.8 < np.median(risen) < 1.05 and found["status"][0] == spo.Status.OK
+        assert risen.max() < 2.0  # 1.6: the path of a link that turns at 12 rad/s is curved
 
 
 def test_nan_stays_in_its_world(device):

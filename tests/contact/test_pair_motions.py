@@ -178,3 +178,26 @@ def test_a_gripper_holds_a_cube(device, drives):
     """0.5 kg, 40 N, friction 0.8, for 5 s: creep of 0.08 mm/s; fingers pressed by a force, and by saturated drives."""
     slip, height, words = held(device, drives)
     assert slip < 1e-3 and height > 0.15 and words == {spo.Status.OK}
+
+
+@pytest.mark.parametrize("mass", [0.5, 2.0])
+def test_drives_at_their_limit_pinch(mass):
+    """Two stiff drives press 20 N each on a cube that hangs: in steps of 10 ms they hold it, with all their force."""
+    half, cube = 0.025, mass * (2 * 0.025) ** 2 / 6.0 * np.eye(3)
+    drive = dict(target_ke=1e4, target_kd=200.0, effort_limit=20.0)
+    box, k = spo.Contact(2, box=(half, half, half)), 9.81 * mass / 1e-4
+    scene = spo.Scene(
+        [*(spo.Body(0.1, inertia=1e-4 * np.eye(3)) for _ in range(2)), spo.Body(mass, inertia=cube)],
+        [*(spo.Hinge("prismatic", -1, i, axis=(0, way, 0), **drive) for i, way in ((0, 1), (1, -1))),
+         spo.Hinge("free", -1, 2)],
+        contacts=[spo.Contact(i, box=((0.01, 0.004, 0.01), (0, way * 0.004, 0, 0, 0, 0, 1)), other=box,
+                              stiffness=k, damping=0.01 * k, eps=1e-4) for i, way in ((0, 1), (1, -1))],
+    )  # fmt: skip
+    q, qd, target = np.array([half, half, 0, 0, 0, 0, 0, 0, 1.0]), np.zeros(8), np.zeros(9)
+    target[:2], target[8] = half - 0.008, 1.0
+    for _ in range(12):
+        step = PairStep(scene, q, qd, 1e-2, target)
+        q, found = step.run(passes=4)
+        qd = found.v
+    np.testing.assert_allclose(np.abs(step.reports(found)[0][:, 1]), 20.0, rtol=1e-3)
+    assert found.excess[2] < 1e-2 and abs(q[4]) < 2e-4  # of 9.81 mm that a free fall takes in this time

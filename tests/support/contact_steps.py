@@ -8,7 +8,7 @@ from warp_spo.reference.contact import MIDPOINT_PASSES, ContactStep
 from . import symbolic
 
 H = 5e-3
-PARABOLA = 5e-6  # of gaps [m] that a parabola finds from half way; 2.7e-6 measured, along 32 rad/s
+PARABOLA = 2e-5  # of gaps [m] that a parabola finds from half way; 1.0e-5 measured, along 28 rad/s
 
 
 def by_point(at, forces):

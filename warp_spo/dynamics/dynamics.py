@@ -25,6 +25,7 @@ from ..execution.programs import Programs
 from ..execution.status_words import kinds_of_coordinates
 from ..runtime.arrays import parse_device, parse_dtype
 from ..runtime.autograd import TensorValues, register
+from ..scene.contact_checks import check_contact_values
 from ..scene.scene import Scene
 from . import (
     actuators,
@@ -237,6 +238,7 @@ class Dynamics:
         self.device = parse_device(device, "Dynamics")
         self.dtype: type[Any] = parse_dtype(dtype, "Dynamics")
         self.variable = _variable_names(variable)
+        check_contact_values("Dynamics", scene, self.dtype.__name__)
         check_loops(scene, loops)
         variable_inertia = any(name in self.variable or scene.values[name].shape[0] > 1 for name in RIGID_VALUES)
         device, precision = read_facts(self.device), self.dtype.__name__

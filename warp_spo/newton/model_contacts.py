@@ -14,6 +14,7 @@ from newton import GeoType, ShapeFlags
 
 from ..errors import UnsupportedError
 from ..scene.collision_shapes import AXIS_TOLERANCE, CollisionShape, SelectedContacts, ShapeSelection
+from ..scene.contact_checks import unsaid_softness
 from ..scene.contact_shapes import SHAPES, kinds_in
 from ..scene.frames import pose_matrix
 from ..scene.ground import HeightField
@@ -250,7 +251,8 @@ def model_contacts(
     values: dict[str, np.ndarray] = {}
     if selected.ground_shape is not None:
         ground, values = shapes.grounds(selected.ground_shape, ground, apart)
-    scene = scene.with_contacts([one for _, made in selected.contacts_by_shape for one in made], ground)
+    with unsaid_softness():  # these are means of two materials, and SolverSPO warns of its own
+        scene = scene.with_contacts([one for _, made in selected.contacts_by_shape for one in made], ground)
     made = ModelContacts(scene, shapes, selected)
     points, grounds = made.point_rows, made.ground_rows
 

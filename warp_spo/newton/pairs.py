@@ -12,6 +12,7 @@ import warp as wp
 from ..errors import UnsupportedError
 from ..kernels import declare
 from ..kernels import newton_contacts as kernels
+from ..scene.contact_checks import unsaid_softness
 from ..scene.contact_values import TURNING_VALUES
 from ..scene.ground import GROUND_VALUES
 from ..scene.scene import Scene
@@ -108,7 +109,8 @@ class ModelPairs:
 
     def added_to(self, scene: Scene) -> Scene:
         """Return a scene with the pairs after its own contacts; materials may differ between worlds."""
-        both = scene.with_contacts([*scene.contacts, *self._contacts], scene.ground)
+        with unsaid_softness():
+            both = scene.with_contacts([*scene.contacts, *self._contacts], scene.ground)
         values = {name: scene.values[name] for name in (*GROUND_VALUES, *TURNING_VALUES) if scene.contacts}
         for name, key in CONTACT_MATERIALS.items():
             own = self._shapes.material(key, self.rows).mean(axis=0)

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import shown
 from ..scene.collision_shapes import KINDS, CollisionShape, moving_bodies
+from ..scene.contact_checks import SOFT
 from ..scene.frames import pose_matrix
 from ..scene.scene import Scene
 from .model_contacts import ModelContacts, ModelShapes
@@ -19,7 +20,6 @@ from .pairs import ModelPairs
 from .slots import ContactSlots
 from .worlds import WorldRows
 
-DEPTH = 0.1  # share of a shape's smallest size by which it may sink at rest
 NAMED = 4  # shapes in the message
 
 
@@ -28,7 +28,7 @@ class SoftShape(NamedTuple):
 
     Attributes:
         shape: of world 0. mass: of its body [kg]. ke: the mean of it and of what it rests on [N/m]. needed: the mean
-            with which it sinks by DEPTH of its size [N/m]. The three are those of the world where it sinks most.
+            with which it sinks by SOFT of its size [N/m]. The three are those of the world where it sinks most.
     """
 
     shape: CollisionShape
@@ -129,7 +129,7 @@ def _soft_shapes(scene: Scene, shapes: ModelShapes, stiffness: dict[int, np.ndar
 
 
 def _give(shape: CollisionShape, most: int) -> float:
-    """Return the sum of the depths of a shape's points, ``most`` for a hull, on its best side, DEPTH of its size deep.
+    """Return the sum of the depths of a shape's points, ``most`` for a hull, on its best side, SOFT of its size deep.
 
     Its size is the smallest one along its axes, rounding included [m].
     """
@@ -138,6 +138,6 @@ def _give(shape: CollisionShape, most: int) -> float:
         return 0.0
     points, radius = np.concatenate([points for points, _ in made]), made[0][1]
     local = points @ pose_matrix(shape.pose)[:3, :3]  # along the shape's axes
-    depth = DEPTH * (np.ptp(local, axis=0).min() + 2.0 * radius)
+    depth = SOFT * (np.ptp(local, axis=0).min() + 2.0 * radius)
     heights = np.concatenate([local, -local], axis=1)
     return float(np.maximum(depth - (heights - heights.min(axis=0)), 0.0).sum(axis=0).max())

@@ -9,7 +9,8 @@ along the normal n, both of which see the point's path bend as its links turn. A
 where S and l are resistances and loads of the hinges' laws, and -B R v is the moment of torsional and rolling friction
 on the body that turns with R v. G, B, S and l depend on v; each pass takes them from the v of the pass before.
 Friction, effort limits and dry friction are secants: dampers that give the bound at the v before. The
-first pass closes all candidates, later passes open those that pull, the last of three or more only closes.
+first pass closes all candidates, later passes open those that pull, the last of three or more only closes. It takes
+the secants at the v before the step.
 
 A step of four passes or more takes two iterations of as many passes. Each finds the kick k = -h Mass^-1 c(u, v) / 2
 half way along u, where c(u, v) = c((u + v) / 2) - c((u - v) / 2) are velocity terms of the mean v of qd and of the
@@ -31,6 +32,7 @@ UNBOUNDED, UNLIMITED = 1e6, 1e10  # effort and velocity limits, position limits,
 HOLD = 300.0  # resistance of a velocity limit, in inertias over the step
 MIDPOINT_PASSES = 4  # passes from which on a step uses the midpoint scheme
 ITERATIONS = 2  # of as many passes each
+PUSH_OUT = 1.0  # speed [m/s] at most at which a point that is slow comes out of the ground
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
 LENGTH, LEAST_LENGTH = 0.1, 3e-5  # of a body that cannot turn, or whose point cannot move; what is too short to be one
 
@@ -124,7 +126,7 @@ def solve(M, laws, limits, points, v, load, h, passes=3, gravity=0.0, outward=No
     candidate = np.maximum(points.after(at, h), points.after(still, h)) + 0.5 * gravity * h * h > 0.0
     fn = candidate * np.maximum(0.0, points.push(at, h))
     w, turn = _slip(points.n, at), _turns(points, v)
-    drive_s, dry_w = laws.s, np.abs(v)
+    drive_s, dry_w = clamped(laws, v, np.zeros(len(v)), h), np.abs(v)
     on = limit_on = None
     for number in range(passes):
         first, last = number == 0, number == passes - 1 and passes >= 3
@@ -360,6 +362,8 @@ class ContactStep:
                     depth = depth + 0.5 * self.h * normal @ J[:3] @ path - 0.125 * self.h**2 * bend
                     bend = 0.0
                 damping = d * k * max(depth, 0.0) if point.dissipates else d
+                if point.is_slow:  # the force is zero at PUSH_OUT
+                    damping = max(damping, k * ((depth - 0.5 * self.h**2 * bend) / PUSH_OUT - self.h))
                 rows.append((J[:3], normal, depth, k, damping, mu, point.eps, weight, bend, J[3:], turning))
                 self.numbers.append(number)
         return Points(*(np.array(column) for column in zip(*rows, strict=True)))

@@ -7,47 +7,14 @@ from typing import Any
 import numpy as np
 
 from .checks import read_only
-from .contacts import ContactPoint
-from .frames import pose_matrix
+from .contact_checks import warn_of_soft_contacts
+from .contact_defaults import DAMPING_TIME, POINTS_AT_REST, NeutralPose, chosen_stiffness
 from .ground import AWAY, HEIGHTS, HeightField, Listed
 from .pairs import pair_values
-from .pickling import Stored
 
 TURNING_VALUES = ("contact_torsional_friction", "contact_rolling_friction")
 CONTACT_VALUES = ("contact_friction", "contact_stiffness", "contact_damping", *TURNING_VALUES)
 """Names of a scene's values that come from its contacts, an entry for each point and, but for TURNING_VALUES, pair."""
-STATIC_SINK = 1.7e-3  # how far a robot sinks in [m] that rests on its points, where the stiffness is chosen
-POINTS_AT_REST = 4  # points at most on which a robot rests
-BODIES_AT_REST = 2  # bodies at most whose points, up to POINTS_AT_REST each, carry a robot
-MARGIN = 1.6  # of the moment that holds up one leg, over what tips it: 360 N m/rad of 226 for a humanoid of 33 kg
-DAMPING = 0.5  # of sqrt(k m), the share of mass over one point; standing is quiet from 0.1 to 2
-STANDARD_GRAVITY = 9.81  # [m/s^2], in scenes without gravity
-
-
-class NeutralPose(Stored):
-    """A scene in its neutral configuration, as the constants of contacts need it."""
-
-    def __init__(self, scene: Any):
-        values = {name: array[0] for name, array in scene.values.items()}
-        self.places = np.empty((len(scene.bodies), 4, 4))
-        self.roots = np.arange(len(scene.bodies))
-        for body in (body for level in scene.tree.levels for body in level):
-            hinge = scene.hinge_of[body]
-            parent = scene.tree.parent[body]
-            place = pose_matrix(values["joint_X_p"][hinge]) @ np.linalg.inv(pose_matrix(values["joint_X_c"][hinge]))
-            if parent >= 0:
-                place, self.roots[body] = self.places[parent] @ place, self.roots[parent]
-            self.places[body] = place
-        self.masses = values["body_mass"]
-        self.coms = np.einsum("bij,bj->bi", self.places[:, :3, :3], values["body_com"]) + self.places[:, :3, 3]
-        size = np.linalg.norm(values["gravity"])
-        self.gravity = float(size) or STANDARD_GRAVITY
-        self.up = -values["gravity"] / size if size else np.array([0.0, 0.0, 1.0])
-
-    def at(self, point: ContactPoint) -> np.ndarray:
-        """Return the place of a point in the inertial frame."""
-        place = self.places[point.body]
-        return place[:3, :3] @ point.position + place[:3, 3]
 
 
 def contact_values(scene: Any) -> dict[str, np.ndarray]:
@@ -72,38 +39,26 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
         found = pair_values(pair, scene, stand)
         for name, value in zip(CONTACT_VALUES, found, strict=False):
             values[name][0, i] = value
-    at = np.array([stand.at(point) for point in points])
-    bodies = np.array([point.body for point in points])
+    at = np.array([stand.at(point) for point in points]).reshape(-1, 3)
+    bodies = np.array([point.body for point in points], dtype=int)
+    radii = np.array([point.radius for point in points])
+    sinks = {
+        body: stand.sink(body, at[bodies == body], radii[bodies == body].max())
+        for body in dict.fromkeys(bodies.tolist())
+    }
     for i, point in enumerate(points):
-        contact, tree = scene.contacts[point.contact], stand.roots == stand.roots[point.body]
-        mass, own = float(stand.masses[tree].sum()), at[bodies == point.body]
-        com = stand.masses[tree] @ stand.coms[tree] / mass if mass else own.mean(axis=0)
-        rests = min(POINTS_AT_REST, int(tree[bodies].sum()))
+        contact, load, mass = scene.contacts[point.contact], *stand.load(point.body)
+        rests = min(POINTS_AT_REST, int((stand.roots == stand.roots[point.body])[bodies].sum()))
         k = contact.stiffness
         if k is None:
-            k = max(
-                mass * stand.gravity / (rests * STATIC_SINK), _foot_stiffness(own, mass * stand.gravity, com, stand.up)
-            )
-            k = k or 1.0  # of massless bodies
+            k = chosen_stiffness(load / (rests * sinks[point.body]), mass)
         d = contact.damping if contact.dissipation is None else contact.dissipation
-        if d is None:
-            shared = max(rests, min(BODIES_AT_REST, len(set(bodies[tree[bodies]]))) * min(len(own), POINTS_AT_REST))
-            d = DAMPING * np.sqrt(k * mass / shared)
+        d = DAMPING_TIME * k if d is None else d
         mine = contact.friction, k, d, contact.torsional_friction, contact.rolling_friction
         for name, value in zip(CONTACT_VALUES, mine, strict=True):
             values[name][0, i] = value
+    warn_of_soft_contacts("Scene", scene, stand)
     return {name: read_only(value) for name, value in values.items()}
-
-
-def _foot_stiffness(points: np.ndarray, weight: float, com: np.ndarray, up: np.ndarray) -> float:
-    """Return k with n k b^2 = MARGIN m g l: the points of one body hold up the robot above; 0 without a sole.
-
-    b is half the width of the points across their longest extent, l how far the centre of mass lies above them.
-    """
-    centred = points - points.mean(axis=0)
-    width = np.ptp(centred @ np.linalg.svd(centred)[2][1]) / 2.0 if len(points) > 2 else 0.0
-    height = max(float(up @ (com - points.mean(axis=0))), 0.0)
-    return MARGIN * weight * height / (len(points) * width**2) if width > 0.0 else 0.0
 
 
 def contact_figures(scene: Any) -> str:

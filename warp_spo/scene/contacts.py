@@ -15,6 +15,7 @@ from .ground import HeightField, Listed, Plane
 
 FRICTIONS = ("friction", "torsional_friction", "rolling_friction")
 """Arguments of a Contact that bound friction."""
+PUSH_OUT = 1.0  # speed [m/s] at most at which a depth is undone where damping is chosen
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -42,14 +43,12 @@ class Contact(ShapeArguments):
             ``other``.
         rolling_friction: ratio of the largest moment across the normal, against rolling and tipping, to the normal
             force [m]: a sphere on a slope below atan(rolling_friction / radius) does not roll. Not with ``other``.
-        stiffness: of each point [N/m]; None: so that a robot that stands on up to four points sinks by 1.7 mm, and so
-            that the points of one body, if they span an area, carry the whole robot. See ``contact_points`` of
-            :class:`Scene`. With ``other``, of the pair; None: the lighter of the two, with all that is connected to
-            it, sinks by 0.1 mm where it rests on the other; of bodies connected to each other, with all that they
-            carry.
-        damping: of each point [N s/m]; None: sqrt(stiffness mass) / 2, with the mass that rests on the point when the
-            robot stands on two such bodies, or on four points. With ``other``, of the pair; None: critical for that
-            mass.
+        stiffness: of each point [N/m]; None: so that the weight of the body's tree, and of all trees that pairs connect
+            with it, sinks by 0.1 mm at most on up to four points, see ``contact_points`` of :class:`Scene`. With
+            ``other``, of the pair; None: so that it sinks as far under the same load and the effort limits of
+            prismatic joints between the two.
+        damping: of each point [N s/m], with ``other`` of the pair; None: stiffness times 10 ms, and of points deep in
+            the ground so much that they come out at 1 m/s.
         dissipation: in place of ``damping``, c of Hunt and Crossley [s/m]: the damping is c ``stiffness`` times the
             depth before the step, zero at the first touch. The scene's ``contact_damping`` of such points is c. Not
             with ``other``.
@@ -71,7 +70,7 @@ class Contact(ShapeArguments):
     stiffness: float | None = None
     damping: float | None = None
     dissipation: float | None = None
-    eps: float = 1e-3
+    eps: float = 1e-4
     walls: bool = True
     label: str = ""
     shape: ContactShape = dataclasses.field(init=False, repr=False)
@@ -107,7 +106,7 @@ class ContactPoint(NamedTuple):
         contact: index of its contact in ``Scene.contacts``. body: index of its body.
         position: of the point, or of the centre of its sphere, in the body frame [m]. radius: of the sphere, or 0 [m].
         eps: speed below which friction is a damper [m/s]. dissipates: its damping grows with the depth. walls: it sees
-            walls of a height field.
+            walls of a height field. is_slow: deep in the ground it comes out at PUSH_OUT at most.
     """
 
     contact: int
@@ -117,13 +116,21 @@ class ContactPoint(NamedTuple):
     eps: float
     dissipates: bool = False
     walls: bool = True
+    is_slow: bool = False
 
 
 def contact_points(contacts: Sequence[Contact]) -> tuple[ContactPoint, ...]:
     """Return the points of all contacts with the ground, contact after contact."""
     return tuple(
         ContactPoint(
-            index, contact.body, (x, y, z), contact.radius, contact.eps, contact.dissipation is not None, contact.walls
+            index,
+            contact.body,
+            (x, y, z),
+            contact.radius,
+            contact.eps,
+            contact.dissipation is not None,
+            contact.walls,
+            contact.damping is None and contact.dissipation is None,
         )
         for index, contact in enumerate(contacts)
         if contact.other is None

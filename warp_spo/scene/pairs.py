@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from ..errors import UnsupportedError, as_integer, quoted
+from .contact_defaults import DAMPING_TIME, NeutralPose, chosen_stiffness
 from .contact_shapes import ConvexShape, as_pair, most_points
 from .contacts import FRICTIONS
-
-STATIC_SINK = 1e-4  # how far the lighter body sinks in [m] that rests on the other one, where the stiffness is chosen
-DAMPING = 2.0  # of sqrt(k m): critical, so that stacks come to rest
+from .parts import DOF_VALUES
 
 
 class ContactPair(NamedTuple):
@@ -82,19 +79,33 @@ def _partner(call: str, contact: Any, contacts: Sequence[Any]) -> Any:
     return own[0]
 
 
-def pair_values(pair: ContactPair, scene: Any, neutral: Any) -> tuple[float, float, float]:
-    """Return friction, stiffness [N/m] and damping [N s/m] of a pair; what its contact leaves open is chosen."""
-    contact, parents, masses = scene.contacts[pair.contact], scene.tree.parent, []
-    together = pair.other >= 0 and neutral.roots[pair.body] == neutral.roots[pair.other]
-    for body in (pair.body, pair.other) if pair.other >= 0 else (pair.body,):
-        way = [body]
-        while parents[way[-1]] >= 0:
-            way.append(parents[way[-1]])
-        if any(scene.hinges[scene.hinge_of[one]].dof_count for one in way):
-            carried = [other for other in range(len(parents)) if not together or scene.tree.is_ancestor(body, other)]
-            carried += [body] if together else []
-            masses.append(sum(neutral.masses[i] for i in set(carried) if neutral.roots[i] == neutral.roots[body]))
-    mass = float(min(masses, default=0.0)) or 1.0
-    k = mass * neutral.gravity / STATIC_SINK if contact.stiffness is None else contact.stiffness
-    d = DAMPING * np.sqrt(k * mass) if contact.damping is None else contact.damping
+def pair_values(pair: ContactPair, scene: Any, neutral: NeutralPose) -> tuple[float, float, float]:
+    """Return friction, stiffness [N/m] and damping [N s/m] of a pair; what its contact leaves open is chosen.
+
+    The load is the weight of all trees that pairs connect with the two, and what prismatic joints between the two press
+    at most.
+    """
+    contact, k = scene.contacts[pair.contact], scene.contacts[pair.contact].stiffness
+    if k is None:
+        moving = [body for body in (pair.body, pair.other) if body >= 0 and neutral.moves[body]]
+        loads, masses = zip(*(neutral.load(body) for body in moving), strict=True) if moving else ((0.0,), (0.0,))
+        sides = [
+            (body, shape) for body, shape in zip((pair.body, pair.other), pair.shapes, strict=True) if body in moving
+        ]
+        sink = min((neutral.sink(body, neutral.on(body, shape.samples), 0.0) for body, shape in sides), default=1.0)
+        k = chosen_stiffness((max(loads) + _pressing(pair, scene)) / sink, min(masses))
+    d = DAMPING_TIME * k if contact.damping is None else contact.damping
     return contact.friction, float(k), float(d)
+
+
+def _pressing(pair: ContactPair, scene: Any) -> float:
+    """Return the sum of the effort limits of prismatic joints between the bodies of a pair [N]."""
+    ways, most = [], scene.values["joint_effort_limit"][0]
+    for body in (pair.body, pair.other):
+        ways.append(set())
+        while body >= 0:
+            ways[-1].add(body)
+            body = scene.tree.parent[body]
+    hinges = [scene.hinge_of[body] for body in ways[0] ^ ways[1]]
+    dofs = [scene.qd_start[hinge] for hinge in hinges if scene.hinges[hinge].kind == "prismatic"]
+    return float(sum(most[dof] for dof in dofs if most[dof] < DOF_VALUES["joint_effort_limit"]))

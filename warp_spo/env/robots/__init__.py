@@ -19,6 +19,14 @@ from ...viewing.shapes import Primitive
 FILES = Path(__file__).parent
 NAMES = ("cartpole", "ant", "panda", "go2", "g1")
 LOOK, TOUCH = 2, 3  # groups of geoms in the files
+MATERIALS = {
+    "ant": {"": (1314.0784722587514, 8.64930599634681)},
+    "go2": {"trunk": (23204.977941176476, 108.00058885600804), "": (23204.977941176476, 152.73589750444714)},
+    "g1": {"sole": (101495.18626132794, 325.1905892840616), "": (48099.5004729706, 316.5924308515969)},
+}
+"""Stiffness [N/m] and damping [N s/m] of contacts by robot and part of their name, the first that fits. They are softer
+than what Contact chooses, because the tasks' policies and results of training are of these."""
+EPS = 1e-3  # speed [m/s] below which friction of these contacts is a damper
 SHAPES = {2: ("sphere", 1), 3: ("capsule", 2), 6: ("box", 3)}
 """MuJoCo's number of a kind of geom -> its name and how many sizes it has."""
 
@@ -73,7 +81,7 @@ def load(
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*left out: contacts")  # which are added here
         scene = from_mujoco(model)
-    touch = [_contact(model, geom) for geom in range(model.ngeom) if model.geom_group[geom] == TOUCH]
+    touch = [_contact(model, geom, name) for geom in range(model.ngeom) if model.geom_group[geom] == TOUCH]
     if contacts is not None:
         touch = [contact for contact in touch if any(part in contact.label for part in contacts)]
     if walls is not None:
@@ -87,15 +95,17 @@ def load(
     return Robot(name, path, scene, np.array(stand.q), np.array(stand.ctrl), (*look, *feet))
 
 
-def _contact(model: Any, geom: int) -> Contact:
-    """Return a contact with the shape of a geom: a sphere or a capsule."""
+def _contact(model: Any, geom: int, robot: str) -> Contact:
+    """Return a contact with the shape of a geom, a sphere or a capsule, and the material of the robot's contacts."""
     kind, body, size, pose, _ = _primitive(model, geom)
     centre = np.array(pose[:3])
     shape: dict[str, Any] = {"sphere": (centre, size[0])}
     if kind == "capsule":
         half = size[1] * _z_axis(pose[3:])
         shape = {"capsule": (centre - half, centre + half, size[0])}
-    return Contact(body, **shape, friction=float(model.geom_friction[geom, 0]), label=model.geom(geom).name)
+    label, friction = model.geom(geom).name, float(model.geom_friction[geom, 0])
+    k, d = next((value for part, value in MATERIALS.get(robot, {}).items() if part in label), (None, None))
+    return Contact(body, **shape, friction=friction, stiffness=k, damping=d, eps=EPS, label=label)
 
 
 def _primitive(model: Any, geom: int) -> Primitive:

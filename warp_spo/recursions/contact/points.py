@@ -13,6 +13,9 @@ spring and the damper see that. Without it a point of a segment that turns fast 
 spring has worked for, and energy rises. Where velocity terms are kicks, all is half way, where J* is the mean along the
 path: the point was half a step back before the step, along that path, and n* J v is its mean speed.
 
+A point that begins deep inside comes out at PUSH_OUT at most, if its damping is chosen: the damper is so large that the
+force is zero at that speed. A larger damper takes energy out whatever it is, and holds up what rests on the point.
+
 A segment works on the points of its links. Those of the link on which other segments begin are shared among these in
 equal numbers, and only the rest stays: they know that link's motion, and their messages to it carry what the points
 add.
@@ -26,7 +29,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...scene.contact_values import TURNING_VALUES
-from ...scene.contacts import ContactPoint
+from ...scene.contacts import PUSH_OUT, ContactPoint
 from ...scene.ground import AWAY, HEIGHTS, PLACE, HeightField, Listed
 from ...scene.scene import Scene
 from ...trace.scalars import Entry, Value, absolute, branch, is_constant, less, lost, reciprocal, select
@@ -64,6 +67,7 @@ class TracedContactPoint:
         cell: of the height field, whose heights the ground has there; None on a plane.
         near: 1 where the surface is near, else 0; None: code shall not branch.
         lever: the arm is not longer [m]. turning: its torsional and rolling friction; None: it has neither.
+        deep: 1 where the damping is larger than the scene's, so that the point comes out slowly, else 0.
     """
 
     number: int
@@ -84,10 +88,14 @@ class TracedContactPoint:
     near: Value | None = None
     lever: Value = 0.0
     turning: TurningFriction | None = None
+    deep: Value = 0.0
 
     def kept_values(self, arm: bool) -> list[Value]:
-        """Return what passes keep: normal, depth, push, damping, motion of the link before; ``arm``: that, too."""
-        damping = [] if is_constant(self.d) or self.d.op == "input" else [self.d]
+        """Return what passes keep: normal, depth, push, damping, motion of the link before; ``arm``: that, too.
+
+        Damping that makes a point slow follows from the depth in four operations.
+        """
+        damping = [] if is_constant(self.d) or self.d.op == "input" or not is_constant(self.deep) else [self.d]
         kept = [*self.arm] if arm else []
         return [*kept, *self.normal, self.depth, self.push, *damping, *self.twist[0], *self.twist[1]]
 
@@ -98,6 +106,7 @@ class TracedContactPoint:
         mask, name = self.near, f"surface of {self.number}"
         only = lambda x, away=0.0: branch(mask, x, away, name)  # noqa: E731
         values: dict[str, Any] = {} if is_constant(self.d) or self.d.op == "input" else {"d": only(self.d)}
+        values |= {} if is_constant(self.deep) else {"deep": only(self.deep)}
         values |= dict(normal=Vector(only(x) for x in self.normal), gap=only(self.gap, -AWAY), push=only(self.push))
         depth, found = only(self.depth, AWAY), [only(x) for x in more]
         return dataclasses.replace(self, **values, depth=depth), found
@@ -195,9 +204,14 @@ def place_points(
                 depth = depth + (0.5 * h) * dot(inward, v + cross(w, arm)) - (0.125 * h) * faster
             below = depth if half_way else depth - (0.5 * h) * faster
             damping = d * (k * select(less(0.0, depth), depth, 0.0)) if point.dissipates else d
+            deep: Value = 0.0
+            if point.is_slow and touched is None:
+                slow = k * (below * (1.0 / PUSH_OUT) - h)  # at PUSH_OUT the force is zero
+                deep = less(damping, slow)
+                damping = select(deep, slow, damping)
             material = k, damping, mu, eps, weight
             push = k * below if half_way else k * below - damping * faster
-            state = turned, below, push, cell, near if branches else None, lever, turning
+            state = turned, below, push, cell, near if branches else None, lever, turning, deep
             found.append(TracedContactPoint(number, on, arm, inward, -depth, mine.twist, *material, *state))
     return found
 

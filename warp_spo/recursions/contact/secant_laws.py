@@ -2,7 +2,9 @@
 
 A law whose force would exceed its bound keeps the direction of its force and loses slope: the line is scaled until it
 meets the bound. Such a secant takes energy out whatever the velocity before was, where a constant force may put energy
-in. A limit is closed or open; the first pass closes those that the step may reach, the last one of three only closes.
+in. The first pass takes it at the rate before the step, which is the rate after it where a drive at its limit holds
+something; from the full line such a drive would press too hard, then too little, and lose what it pinches. A limit is
+closed or open; the first pass closes those that the step may reach, the last one of three only closes.
 """
 
 from __future__ import annotations
@@ -65,7 +67,7 @@ class SecantLaw:
         elif law.role == FRICTION:
             self.variable = pass_variables.variable(law.scale * self._damper(absolute(qd)))
         elif law.least is not None and law.most is not None:
-            self.variable = pass_variables.variable(1.0)
+            self.variable = pass_variables.variable(self._share(law.line(0.0)))
         else:
             self.variable = None
 
@@ -129,11 +131,14 @@ class SecantLaw:
         if x is None:
             return 0.0
         line = law.line(gain)
-        size, bound = absolute(line), _positive(self._bound(line))
-        beyond = _positive(x * size - bound)
-        share = size + law.scale * law.resistance * (step_weight * beyond)
-        pass_variables.keep(x, select(less(bound, share), bound * reciprocal(share), 1.0))
+        beyond = _positive(x * absolute(line) - _positive(self._bound(line)))
+        pass_variables.keep(x, self._share(line, law.scale * law.resistance * (step_weight * beyond)))
         return law.scale * beyond
+
+    def _share(self, line: Value, more: Value = 0.0) -> Value:
+        """Return by which share a force, and ``more`` of the same sign that is expected, meets its bound."""
+        size, bound = absolute(line) + more, _positive(self._bound(line))
+        return select(less(bound, size), bound * reciprocal(size), 1.0)
 
 
 def _positive(x: Value) -> Value:

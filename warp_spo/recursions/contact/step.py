@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 PASSES = 3  # what a step with contacts takes if the caller does not say
 TOLERANCE = 0.1  # share of the weight, or of an effort limit, by which the last pass may exceed its laws without a word
+BURIED = 1e30  # push [N] that a point lacks which comes out of the ground slowly
 FELT = 64.0  # roundings of a pivot; an inertia that is less of it may be rounding alone
 NOTHING, NO_PUSH = Articulated.build(lambda i, j: 0.0), Vector([0.0] * 6)  # damper and load of no point
 REPORTS = ("contact_f", "contact_gap", "contact_slip", "contact_excess", "contact_moment")
@@ -116,6 +117,7 @@ class ContactStepTrace(Step):
         if status or "contact_excess" in self.reports:
             trace.graph.step = "excess|e"
             self.excess = [self._last(largest(values)) for values in (*excess[:2], efforts, excess[2])]
+            self._flag_deep(points)
         phases.add_prologue(sent_ahead + pass_variables.initial_stores)
         phases.add_epilogue(self._after(qdd, status))
         phases.add_sweep(sent + passed + pass_variables.stores)
@@ -141,6 +143,13 @@ class ContactStepTrace(Step):
             for values, value in zip(excess, worst, strict=True):
                 values.append(value)
         return found
+
+    def _flag_deep(self, points: list[TracedContactPoint]) -> None:
+        """Count a push that a deep point lacks, so that it comes out slowly, as missing."""
+        deep = [point.deep for point in points if not is_constant(point.deep)]
+        if deep:
+            self.phases.add_invariants([some := total(deep)])
+            self.excess[3] = select(some, BURIED, self.excess[3])
 
     def _bias(self) -> tuple[dict[int, Value], list[Store]]:
         """Return velocity terms, unless kicks replace them, gravity and loads as forces of the dofs, and the stores
