@@ -23,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .dense import Dense
+from .field_spheres import nearest_points
 from .rotations import homogeneous
 
 CREEP = 1e-4  # rate below which dry friction is a damper [rad/s, m/s]
@@ -306,15 +307,20 @@ class ContactStep:
             turning = dense.jacobian_bias(path, [(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
             share = 0.5 if self.half_way else 1.0
             moves = share * self.h * dense.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3] @ path
-            at = at - point.radius * np.array(ground.normal if plane else (0.0, 0.0, 1.0))
+            centre, rolls = at, point.radius > 0.0 and not plane
+            at = at if rolls else at - point.radius * np.array(ground.normal if plane else (0.0, 0.0, 1.0))
             there = self.neutral.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
             weight = SLIP * np.trace(there @ inverse @ there.T) / 3.0
             k, d, mu = (dense.value(f"contact_{name}")[number] for name in ("stiffness", "damping", "friction"))
             if plane:
                 touched = [(np.array(ground.normal), ground.height - (at - moved) @ ground.normal)]
+            elif rolls:
+                which = int(field[0]) if len(field) else 0
+                touched = nearest_points(ground, at - moved, point.radius, which, point.walls and self._touches_twice)
             else:
                 touched = surfaces(ground, at - moved, int(field[0]) if len(field) else 0, moves, point.walls)
             for normal, depth in touched:
+                at = centre - point.radius * normal if rolls else at
                 J, bend = dense._jacobian_at(point.body, at)[:3], normal @ turning
                 if self.half_way:  # half a step back
                     depth = depth + 0.5 * self.h * normal @ J @ path - 0.125 * self.h**2 * bend
@@ -323,6 +329,11 @@ class ContactStep:
                 rows.append((J, normal, depth, k, damping, mu, point.eps, weight, bend))
                 self.numbers.append(number)
         return Points(*(np.array(column) for column in zip(*rows, strict=True)))
+
+    @property
+    def _touches_twice(self):
+        """Whether a sphere may touch two places of the field."""
+        return self.scene.ground.has_walls or self.scene.ground.has_creases
 
     def _positions(self):
         """Return the coordinate of each dof; NaN of those without one."""

@@ -3,7 +3,7 @@
 A plane has one normal. A height field is bilinear in each cell: the depth is (H - z) n_z with the normal n of the field
 under the point, held over the step. Where a cell is steeper than STEEP, the point has two surfaces instead: the wall,
 which is the cell's plane and ends at its highest corner, and the floor, which is flat at the height of its lowest one.
-A point that the step takes into such a cell has its wall already.
+A point that the step takes into such a cell has its wall already. Spheres on a field are in :mod:`.field_spheres`.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class Corners(NamedTuple):
         rows, columns = ground.heights.shape[-2:]
         first = i * float(columns) + j
         if ground.count > 1:
-            first = floor(_clamp(place.field, ground.count - 1.0)) * float(rows * columns) + first
+            first = floor(clamp(place.field, ground.count - 1.0)) * float(rows * columns) + first
         if together:
             h00, h01, h10, h11 = lookup(graph, GROUND, first, CORNERS)
         else:
@@ -214,13 +214,13 @@ def height(
 
 def _cell(x: Value, points: int) -> tuple[Value, Value]:
     """Return the cell of a place in cells, and how far in it the place is; the last cell beyond the edges."""
-    x = _clamp(x, points - 1.0)
+    x = clamp(x, points - 1.0)
     cell = floor(x)
     cell = select(less(cell, points - 1.5), cell, points - 2.0)
     return cell, x - cell
 
 
-def _clamp(x: Value, most: float) -> Value:
+def clamp(x: Value, most: float) -> Value:
     """Return a number between zero and ``most``, so that no table is read beyond its end; NaN becomes zero."""
     x = select(less(0.0, x), x, 0.0)
     return select(less(x, most), x, most)
@@ -232,12 +232,13 @@ def _facing(slope_x: Value, slope_y: Value) -> Vector:
     return Vector((-(slope_x * size), -(slope_y * size), size))
 
 
-def surface_count(ground: Plane | HeightField | Listed | None, varies: bool, walls: bool) -> int:
+def surface_count(ground: Plane | HeightField | Listed | None, varies: bool, walls: bool, radius: float) -> int:
     """Return how many surfaces a point may touch.
 
-    ``varies``: the heights of a field are variable. ``walls``: as for :func:`surfaces`.
+    ``varies``: the heights of a field are variable. ``walls``: as for :func:`surfaces`. ``radius``: of its sphere.
     """
-    return 2 if walls and has_walls(ground, varies) else 1
+    creased = radius > 0.0 and isinstance(ground, HeightField) and ground.has_creases
+    return 2 if walls and (creased or has_walls(ground, varies)) else 1
 
 
 def has_walls(ground: Plane | HeightField | Listed | None, varies: bool) -> bool:

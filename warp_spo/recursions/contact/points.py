@@ -39,6 +39,7 @@ from ..model.tracing import Trace
 from ..motion import VelocityTerms, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
 from ..step.joint_laws import is_number
+from .field_spheres import ring, sphere_surfaces
 from .ground import Corners, GroundOffset, Surface, directions, lowest, surface_count, surfaces
 from .velocity_kicks import KICK, PATH
 
@@ -169,10 +170,12 @@ def place_points(
             radius, eps, weight = trace.links.shared_constants.of_point(number, "contact", (radius, eps, weight))
         trace.graph.step = f"contact {number}|c"
         toward = mine.axes[:count]
-        arm = centre if is_number(radius, 0.0) else centre - toward[lowest(ground)] * radius
+        rolls = point.radius > 0.0 and isinstance(ground, HeightField)  # it touches where the field is nearest
+        arm = centre if rolls or is_number(radius, 0.0) else centre - toward[lowest(ground)] * radius
         lever = radius + total(absolute(x) for x in centre)
         at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
-        at[lowest(ground)] = at[lowest(ground)] - radius
+        if not rolls:
+            at[lowest(ground)] = at[lowest(ground)] - radius
         k, d, mu = (joint_laws.value(f"contact_{name}", number) for name in ("stiffness", "damping", "friction"))
         turned = mine.axes[-len(IDENTITY) :] if oriented else []
         h, moving = joint_laws.h, mine.motion
@@ -181,11 +184,17 @@ def place_points(
         w, v = mine.travel
         ahead = 0.5 * h if half_way else h
         moves = [ahead * dot(axis, v + cross(w, centre)) for axis in toward]
-        touched = [_listed_surface(joint_laws, number)] if isinstance(ground, Listed) else None
-        for normal, depth, cell, near in touched or surfaces(
-            trace.graph, ground, at, place_of_ground, moves, point.walls
-        ):
+        if isinstance(ground, Listed):
+            touched = [_listed_surface(joint_laws, number)]
+        elif rolls and isinstance(ground, HeightField):
+            second = surface_count(ground, place_of_ground.varies, point.walls, point.radius) == 2
+            cells = ring(ground, point.radius)
+            touched = sphere_surfaces(trace.graph, ground, at, place_of_ground, radius, cells, second)
+        else:
+            touched = surfaces(trace.graph, ground, at, place_of_ground, moves, point.walls)
+        for normal, depth, cell, near in touched:
             inward = Vector(total(n * axis[c] for n, axis in zip(normal, toward, strict=True)) for c in range(3))
+            arm = centre - inward * radius if rolls else arm
             faster = h * dot(inward, bend)
             if half_way:  # half a step back, along a parabola
                 depth = depth + (0.5 * h) * dot(inward, v + cross(w, arm)) - (0.125 * h) * faster
@@ -230,7 +239,7 @@ def _carry_outward(
 
 def surface_numbers(scene: Scene, varies: bool) -> list[range]:
     """Return the numbers of the surfaces that each contact point may touch; ``varies``: heights are variable."""
-    counts = [surface_count(scene.ground, varies, point.walls) for point in scene.contact_points]
+    counts = [surface_count(scene.ground, varies, point.walls, point.radius) for point in scene.contact_points]
     ends = itertools.accumulate(counts)
     return [range(end - count, end) for end, count in zip(ends, counts, strict=True)]
 
