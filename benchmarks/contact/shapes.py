@@ -155,9 +155,29 @@ def balls() -> Iterator[Line]:
             yield Line(motion, "energy that a step gains [J]", dt, max(np.diff(rolls[:, 2]).max(), 0.0), 1e-6)
 
 
+def rolled_wheel(dt: float, dtype: str = "float64") -> np.ndarray:
+    """Return the states [time, 13] of a wheel of 100 mm that rolls at 1 m/s on a plane for a second."""
+    radius, half = 0.1, 0.03
+    across = MASS * (3.0 * radius**2 + (2.0 * half) ** 2) / 12.0
+    body = spo.Body(MASS, inertia=np.diag([across, 0.5 * MASS * radius**2, across]), label="wheel")
+    wheel = spo.Contact(0, cylinder=((0.0, -half, 0.0), (0.0, half, 0.0), radius))
+    scene = spo.Scene([body], [spo.Hinge("free", -1, 0)], contacts=[wheel], ground=spo.Plane())
+    depth = MASS * 9.81 / (2.0 * scene.values["contact_stiffness"][0, 0])  # on both rims
+    start = [0.0, 0.0, radius - depth, 0.0, 0.0, 0.0, 1.0]
+    return rolled(scene, start, [1.0, 0.0, 0.0, 0.0, 1.0 / radius, 0.0], dt, 1.0, dtype)
+
+
+def wheels() -> Iterator[Line]:
+    for dtype in ("float64", "float32"):
+        for dt in (1e-3, 2e-3, 5e-3, 1e-2):
+            speed = rolled_wheel(dt, dtype)[-1, 7]
+            yield Line(f"wheel of 100 mm on a plane, {dtype}", "speed that 1 m/s loses in 1 s", dt, 1.0 - speed, 0.02)
+
+
 MOTIONS: dict[str, Callable[[], Iterator[Line]]] = {
     "spheres": lambda: (line for name in fields() for radius in RADII for line in spheres_on(name, radius, 500)),
     "balls": balls,
+    "wheels": wheels,
 }
 
 

@@ -25,6 +25,7 @@ import numpy as np
 from .dense import Dense
 from .field_spheres import nearest_points
 from .rotations import homogeneous
+from .supports import support_path
 
 CREEP = 1e-4  # rate below which dry friction is a damper [rad/s, m/s]
 UNBOUNDED, UNLIMITED = 1e6, 1e10  # effort and velocity limits, position limits, of this size and more are none
@@ -219,6 +220,12 @@ def surfaces(field, at, number=0, moves=(0.0, 0.0, 0.0), walls=True):
     return [(upward(slope), (height - z) * upward(slope)[2]), *(wall(*after) if rises else [])]
 
 
+def upward(field, at, number=0):
+    """Return the normal of a field over or under a place, the vertical where its cell is a floor and a wall."""
+    normal = surfaces(field, at, number)[0][0]
+    return normal
+
+
 class ContactStep:
     """One step of a scene with contacts in one world.
 
@@ -303,25 +310,30 @@ class ContactStep:
         field = dense.value("ground_field")
         inverse = np.linalg.pinv(self.neutral.mass_matrix)
         for number, point in enumerate(self.scene.contact_points):
-            at = (dense.body_matrix[point.body] @ homogeneous([*point.position, 0, 0, 0, 1]))[:3, 3]
-            turning = dense.jacobian_bias(path, [(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
+            which = int(field[0]) if len(field) else 0
+            middle = (dense.body_matrix[point.body] @ homogeneous([*point.position, 0, 0, 0, 1]))[:3, 3]
+            up = np.array(ground.normal if plane else (0.0, 0.0, 1.0))
+            if point.support is not None and not plane:
+                up = upward(ground, middle - moved, which)
+            seat, hub, more = self._support_place(point, up, path)
+            at = (dense.body_matrix[point.body] @ homogeneous([*seat, 0, 0, 0, 1]))[:3, 3]
+            turning = dense.jacobian_bias(path, [(point.body, (*hub, 0, 0, 0, 1))])[0, :3]
             share = 0.5 if self.half_way else 1.0
-            moves = share * self.h * dense.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3] @ path
-            centre, rolls = at, point.radius > 0.0 and not plane
-            at = at if rolls else at - point.radius * np.array(ground.normal if plane else (0.0, 0.0, 1.0))
+            moves = share * self.h * dense.jacobian([(point.body, (*seat, 0, 0, 0, 1))])[0, :3] @ path
+            centre, rolls = at, point.radius > 0.0 and not plane and point.support is None
+            at = at if rolls else at - point.radius * up
             there = self.neutral.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
             weight = SLIP * np.trace(there @ inverse @ there.T) / 3.0
             k, d, mu = (dense.value(f"contact_{name}")[number] for name in ("stiffness", "damping", "friction"))
             if plane:
                 touched = [(np.array(ground.normal), ground.height - (at - moved) @ ground.normal)]
             elif rolls:
-                which = int(field[0]) if len(field) else 0
                 touched = nearest_points(ground, at - moved, point.radius, which, point.walls and self._touches_twice)
             else:
-                touched = surfaces(ground, at - moved, int(field[0]) if len(field) else 0, moves, point.walls)
+                touched = surfaces(ground, at - moved, which, moves, point.walls)
             for normal, depth in touched:
                 at = centre - point.radius * normal if rolls else at
-                J, bend = dense._jacobian_at(point.body, at)[:3], normal @ turning
+                J, bend = dense._jacobian_at(point.body, at)[:3], normal @ turning + more
                 if self.half_way:  # half a step back
                     depth = depth + 0.5 * self.h * normal @ J @ path - 0.125 * self.h**2 * bend
                     bend = 0.0
@@ -329,6 +341,19 @@ class ContactStep:
                 rows.append((J, normal, depth, k, damping, mu, point.eps, weight, bend))
                 self.numbers.append(number)
         return Points(*(np.array(column) for column in zip(*rows, strict=True)))
+
+    def _support_place(self, point, up, path):
+        """Return a point that moves over its shape, the material one whose path counts, and its further bend.
+
+        ``up``: the ground's normal, inertial axes. The first two are in the body frame.
+        """
+        if point.support is None:
+            return point.position, point.position, 0.0
+        pose, frame = self.dense.body_matrix[point.body], [(point.body, (*point.position, 0, 0, 0, 1))]
+        turn, w = pose[:3, :3], self.dense.jacobian(frame)[0, 3:] @ path
+        hub, more = support_path(point.support, turn, up, w, self.dense.jacobian_bias(path, frame)[0, 3:])
+        seat = point.position + point.support.offset(turn.T @ up)
+        return seat, point.position + turn.T @ hub, more
 
     @property
     def _touches_twice(self):

@@ -46,7 +46,7 @@ class NeutralPose(Stored):
     def at(self, point: ContactPoint) -> np.ndarray:
         """Return the place of a point in the inertial frame."""
         place = self.places[point.body]
-        return place[:3, :3] @ point.position + place[:3, 3]
+        return place[:3, :3] @ point.place(place[:3, :3].T @ self.up) + place[:3, 3]
 
 
 def contact_values(scene: Any) -> dict[str, np.ndarray]:

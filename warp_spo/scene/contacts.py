@@ -12,6 +12,7 @@ from ..errors import UnsupportedError, as_integer
 from .checks import checked_array, read_only
 from .contact_shapes import ARGUMENTS, SHAPES, ContactShape, ShapeArguments
 from .ground import HeightField, Listed, Plane
+from .supports import Support
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -63,8 +64,9 @@ class Contact(ShapeArguments):
     walls: bool = True
     label: str = ""
     shape: ContactShape = dataclasses.field(init=False, repr=False)
-    positions: np.ndarray = dataclasses.field(init=False, repr=False)  # of the points, in the body frame [point, 3]
+    positions: np.ndarray = dataclasses.field(init=False, repr=False)  # on the shape, in the body frame [position, 3]
     radius: float = dataclasses.field(init=False, repr=False)  # of the sphere about each
+    placements: tuple[tuple[Any, Support | None], ...] = dataclasses.field(init=False, repr=False)  # as of ContactPoint
 
     def __post_init__(self) -> None:
         call = f"Contact({self.label!r})" if self.label else "Contact"
@@ -86,6 +88,11 @@ class Contact(ShapeArguments):
         object.__setattr__(self, "shape", shape)
         object.__setattr__(self, "positions", read_only(positions))
         object.__setattr__(self, "radius", radius)
+        middle, _, moving = shape.supports()
+        placements = [(tuple(middle.tolist()), support) for support in moving]
+        object.__setattr__(
+            self, "placements", tuple(placements or ((tuple(place), None) for place in positions.tolist()))
+        )
 
 
 class ContactPoint(NamedTuple):
@@ -94,6 +101,7 @@ class ContactPoint(NamedTuple):
     Attributes:
         contact: index of its contact in ``Scene.contacts``. body: index of its body.
         position: of the point, or of the centre of its sphere, in the body frame [m]. radius: of the sphere, or 0 [m].
+        support: how the point moves over a shape with its middle at ``position``, as the body turns; None: it does not.
         eps: speed below which friction is a damper [m/s]. dissipates: its damping grows with the depth. walls: it sees
             walls of a height field.
     """
@@ -105,17 +113,30 @@ class ContactPoint(NamedTuple):
     eps: float
     dissipates: bool = False
     walls: bool = True
+    support: Support | None = None
+
+    def place(self, normal: Any) -> np.ndarray:
+        """Return where the point is, or the centre of its sphere, in the body frame [m]; ``normal`` of the ground."""
+        position = np.asarray(self.position)
+        return position if self.support is None else position + self.support.offset(normal)
 
 
 def contact_points(contacts: Sequence[Contact]) -> tuple[ContactPoint, ...]:
     """Return the points of all contacts with the ground, contact after contact."""
     return tuple(
         ContactPoint(
-            index, contact.body, (x, y, z), contact.radius, contact.eps, contact.dissipation is not None, contact.walls
+            index,
+            contact.body,
+            place,
+            contact.radius,
+            contact.eps,
+            contact.dissipation is not None,
+            contact.walls,
+            support,
         )
         for index, contact in enumerate(contacts)
         if contact.other is None
-        for x, y, z in contact.positions.tolist()
+        for place, support in contact.placements
     )
 
 

@@ -106,6 +106,18 @@ def surfaces(
     return [bottom, Surface(wall, select(there, (middle - z) * wall[2], AWAY), cell, there)]
 
 
+def upward(graph: Graph, ground: HeightField, at: list[Value], place: GroundOffset) -> Vector:
+    """Return the normal of a field over or under a place, the vertical where its cell is steep."""
+    rows, columns = ground.heights.shape[-2:]
+    rate_x, rate_y = (1.0 / cell for cell in ground.cells)
+    i, s = _cell((at[0] - place.origin[0] - ground.origin[0]) * rate_x, rows)
+    j, t = _cell((at[1] - place.origin[1] - ground.origin[1]) * rate_y, columns)
+    cell = Corners.of(graph, ground, place, i, j)
+    smooth = _facing((cell.run + cell.twist * t) * rate_x, (cell.rise + cell.twist * s) * rate_y)
+    steep = less(STEEP * STEEP, cell.steepness(rate_x, rate_y))
+    return Vector(select(steep, a, b) for a, b in zip(IDENTITY[2], smooth, strict=True))
+
+
 class Corners(NamedTuple):
     """The heights at the corners of a cell, and the number of the first one, row after row, field after field."""
 
@@ -232,12 +244,13 @@ def _facing(slope_x: Value, slope_y: Value) -> Vector:
     return Vector((-(slope_x * size), -(slope_y * size), size))
 
 
-def surface_count(ground: Plane | HeightField | Listed | None, varies: bool, walls: bool, radius: float) -> int:
+def surface_count(ground: Plane | HeightField | Listed | None, varies: bool, walls: bool, sphere: bool) -> int:
     """Return how many surfaces a point may touch.
 
-    ``varies``: the heights of a field are variable. ``walls``: as for :func:`surfaces`. ``radius``: of its sphere.
+    ``varies``: the heights of a field are variable. ``walls``: as for :func:`surfaces`. ``sphere``: it touches a field
+    as one.
     """
-    creased = radius > 0.0 and isinstance(ground, HeightField) and ground.has_creases
+    creased = sphere and isinstance(ground, HeightField) and ground.has_creases
     return 2 if walls and (creased or has_walls(ground, varies)) else 1
 
 
