@@ -4,5 +4,6 @@
 ``throws``: energy of a million random states.
 ``motions`` and ``courses``: every figure that contacts promise, on a CPU. ``mujoco``: G1 beside MuJoCo, its error
 against run time. ``peers``: steps beside mujoco_warp and Newton's solvers, on a GPU. ``gradients``: their time, errors
-and jumps. ``terrain``: a picture of the kinds of terrain. All but ``scenes`` and ``courses`` are commands.
+and jumps. ``terrain``: a picture of the kinds of terrain. ``shapes``: shapes on fields and planes beside truths. All
+but ``scenes`` and ``courses`` are commands.
 """

@@ -210,7 +210,10 @@ class ModelContacts(NamedTuple):
         """Index of the shape of each contact point [world, point]."""
         place = {int(row): column for column, row in enumerate(self.shapes.rows[0])}
         columns = [
-            place[shape.index] for shape, made in self.selected.contacts_by_shape for one in made for _ in one.positions
+            place[shape.index]
+            for shape, made in self.selected.contacts_by_shape
+            for one in made
+            for _ in one.placements
         ]
         return self.shapes.rows[:, columns]
 

@@ -133,11 +133,11 @@ def _give(shape: CollisionShape, most: int) -> float:
 
     Its size is the smallest one along its axes, rounding included [m].
     """
-    made = [one.ground_points() for one in shape.contact_shape(clean=True).on_ground(shape.rounding, most)]
+    made = shape.contact_shape(clean=True).on_ground(shape.rounding, most)
     if not made:
         return 0.0
-    points, radius = np.concatenate([points for points, _ in made]), made[0][1]
-    local = points @ pose_matrix(shape.pose)[:3, :3]  # along the shape's axes
-    depth = SOFT * (np.ptp(local, axis=0).min() + 2.0 * radius)
-    heights = np.concatenate([local, -local], axis=1)
-    return float(np.maximum(depth - (heights - heights.min(axis=0)), 0.0).sum(axis=0).max())
+    around, radius = np.concatenate([one.ground_points()[0] for one in made]), made[0].ground_points()[1]
+    axes = pose_matrix(shape.pose)[:3, :3].T
+    depth = SOFT * (np.ptp(around @ axes.T, axis=0).min() + 2.0 * radius)
+    heights = [np.concatenate([one.points_on_plane(up) for one in made]) @ up for up in (*axes, *-axes)]
+    return max(float(np.maximum(depth - (each - each.min()), 0.0).sum()) for each in heights)

@@ -25,7 +25,9 @@ from typing import NamedTuple
 import numpy as np
 
 from .dense import Dense
+from .field_spheres import nearest_points
 from .rotations import homogeneous
+from .supports import support_path
 
 CREEP = 1e-4  # rate below which dry friction is a damper [rad/s, m/s]
 UNBOUNDED, UNLIMITED = 1e6, 1e10  # effort and velocity limits, position limits, of this size and more are none
@@ -256,6 +258,12 @@ def surfaces(field, at, number=0, moves=(0.0, 0.0, 0.0), walls=True):
     return [(upward(slope), (height - z) * upward(slope)[2]), *(wall(*after) if rises else [])]
 
 
+def upward(field, at, number=0):
+    """Return the normal of a field over or under a place, the vertical where its cell is a floor and a wall."""
+    normal = surfaces(field, at, number)[0][0]
+    return normal
+
+
 class ContactStep:
     """One step of a scene with contacts in one world.
 
@@ -340,11 +348,18 @@ class ContactStep:
         field = dense.value("ground_field")
         inverse = np.linalg.pinv(self.neutral.mass_matrix)
         for number, point in enumerate(self.scene.contact_points):
-            at = (dense.body_matrix[point.body] @ homogeneous([*point.position, 0, 0, 0, 1]))[:3, 3]
-            bending = dense.jacobian_bias(path, [(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
+            which = int(field[0]) if len(field) else 0
+            middle = (dense.body_matrix[point.body] @ homogeneous([*point.position, 0, 0, 0, 1]))[:3, 3]
+            up = np.array(ground.normal if plane else (0.0, 0.0, 1.0))
+            if point.support is not None and not plane:
+                up = upward(ground, middle - moved, which)
+            seat, hub, more = self._support_place(point, up, path)
+            at = (dense.body_matrix[point.body] @ homogeneous([*seat, 0, 0, 0, 1]))[:3, 3]
+            bending = dense.jacobian_bias(path, [(point.body, (*hub, 0, 0, 0, 1))])[0, :3]
             share = 0.5 if self.half_way else 1.0
-            moves = share * self.h * dense.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3] @ path
-            at = at - point.radius * np.array(ground.normal if plane else (0.0, 0.0, 1.0))
+            moves = share * self.h * dense.jacobian([(point.body, (*seat, 0, 0, 0, 1))])[0, :3] @ path
+            centre, rolls = at, point.radius > 0.0 and not plane and point.support is None
+            at = at if rolls else at - point.radius * up
             there = self.neutral.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0]
             weight, turn_weight = (SLIP * np.trace(part @ inverse @ part.T) / 3.0 for part in (there[:3], there[3:]))
             moves_and_turns = min(weight, turn_weight) > 0.0 and weight / turn_weight > LEAST_LENGTH**2
@@ -354,10 +369,13 @@ class ContactStep:
             turning += [length, turn_weight]
             if plane:
                 touched = [(np.array(ground.normal), ground.height - (at - moved) @ ground.normal)]
+            elif rolls:
+                touched = nearest_points(ground, at - moved, point.radius, which, point.walls and self._touches_twice)
             else:
-                touched = surfaces(ground, at - moved, int(field[0]) if len(field) else 0, moves, point.walls)
+                touched = surfaces(ground, at - moved, which, moves, point.walls)
             for normal, depth in touched:
-                J, bend = dense._jacobian_at(point.body, at), normal @ bending
+                at = centre - point.radius * normal if rolls else at
+                J, bend = dense._jacobian_at(point.body, at), normal @ bending + more
                 if self.half_way:  # half a step back
                     depth = depth + 0.5 * self.h * normal @ J[:3] @ path - 0.125 * self.h**2 * bend
                     bend = 0.0
@@ -367,6 +385,24 @@ class ContactStep:
                 rows.append((J[:3], normal, depth, k, damping, mu, point.eps, weight, bend, J[3:], turning))
                 self.numbers.append(number)
         return Points(*(np.array(column) for column in zip(*rows, strict=True)))
+
+    def _support_place(self, point, up, path):
+        """Return a point that moves over its shape, the material one whose path counts, and its further bend.
+
+        ``up``: the ground's normal, inertial axes. The first two are in the body frame.
+        """
+        if point.support is None:
+            return point.position, point.position, 0.0
+        pose, frame = self.dense.body_matrix[point.body], [(point.body, (*point.position, 0, 0, 0, 1))]
+        turn, w = pose[:3, :3], self.dense.jacobian(frame)[0, 3:] @ path
+        hub, more = support_path(point.support, turn, up, w, self.dense.jacobian_bias(path, frame)[0, 3:])
+        seat = point.position + point.support.offset(turn.T @ up)
+        return seat, point.position + turn.T @ hub, more
+
+    @property
+    def _touches_twice(self):
+        """Whether a sphere may touch two places of the field."""
+        return self.scene.ground.has_walls or self.scene.ground.has_creases
 
     def _positions(self):
         """Return the coordinate of each dof; NaN of those without one."""

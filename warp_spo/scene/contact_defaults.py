@@ -59,7 +59,7 @@ class NeutralPose(Stored):
 
     def at(self, point: ContactPoint) -> np.ndarray:
         """Return the place of a point in the inertial frame."""
-        return self.on(point.body, np.array(point.position))
+        return self.on(point.body, point.place(self.places[point.body][:3, :3].T @ self.up))
 
     def on(self, body: int, points: np.ndarray) -> np.ndarray:
         """Return the places of points [..., 3] of a body in the inertial frame."""

@@ -20,13 +20,15 @@ from .frames import pose_matrix
 from .hulls import Hull, convex_hull, grown, is_convex, with_corners
 from .parts import IDENTITY_POSE, checked_pose
 from .pickling import StoredPart
+from .supports import RIM, SURFACE, Support
 
 SWEPT_SEGMENT, BOX, HULL = 0, 1, 2
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])  # of a cube
 FACE = 8  # corners at most of the common part of two rectangles
 FACES = 16  # corners at most of a face of one hull and one of another together
 PART = 4  # ends of the part of a segment that is near a box or a hull
-SPREAD = 256  # points on a round surface, of which those of a hull are chosen
+SPREAD = 256  # points on a round surface that stand for it
+RING = 32  # points on a rim that stand for it
 SOME = 64  # directions in which corners of a mesh are looked for at first
 ROUNDING = 1e-15  # share of a shape's size by which an entry of a point that should be zero may differ
 Names = Mapping[str, tuple[str, ...]]
@@ -38,8 +40,9 @@ class ShapeArguments(StoredPart):
     """A body, and the argument that gives its contact shape.
 
     A ``point`` is one point. A ``sphere`` touches the ground with its lowest point, which moves over the sphere as the
-    body turns. A ``capsule`` is the two spheres at its ends; a ``box`` its eight corners; a ``hull`` those of its
-    points that lie on the convex hull.
+    body turns, and so does an ``ellipsoid``. A ``capsule`` is the two spheres at its ends; a ``box`` its eight corners;
+    a ``cylinder`` and a ``cone`` the lowest points of both rims, or of the rim and the tip, and two points beside the
+    lower one, 120 degrees along the rim; a ``hull`` those of its points that lie on the convex hull.
 
     Args:
         body: index of the body.
@@ -47,6 +50,9 @@ class ShapeArguments(StoredPart):
         sphere: ((x, y, z), radius) or (x, y, z, radius), or a radius about the body frame's origin [m].
         capsule: ((x, y, z) of one end of its axis, (x, y, z) of the other, radius) [m].
         box: half its sizes (x, y, z) [m], about the body frame's origin; or (half its sizes, its pose in the body).
+        cylinder: ((x, y, z) of one end of its axis, (x, y, z) of the other, radius) [m].
+        cone: ((x, y, z) of the middle of its base, (x, y, z) of its tip, radius of the base) [m].
+        ellipsoid: half its axes (x, y, z) [m], about the body frame's origin; or (half its axes, its pose in the body).
         hull: points [n, 3], [m].
     """
 
@@ -55,6 +61,9 @@ class ShapeArguments(StoredPart):
     sphere: Any = None
     capsule: Any = None
     box: Any = None
+    cylinder: Any = None
+    cone: Any = None
+    ellipsoid: Any = None
     hull: Any = None
 
 
@@ -154,6 +163,18 @@ class ContactShape(StoredPart):
     def ground_points(self) -> tuple[np.ndarray, float]:
         """Return the points that touch the ground in the body frame [point, 3] [m], and the radius about each [m]."""
         raise NotImplementedError
+
+    def supports(self) -> tuple[np.ndarray, float, list[Support]]:
+        """Return the middle of a shape whose points move over it (3,) [m], the radius about each, and these points.
+
+        None: the points stay where they are in the body.
+        """
+        return np.zeros(3), 0.0, []
+
+    def points_on_plane(self, normal: np.ndarray) -> np.ndarray:
+        """Return the points that touch a plane with this normal, in the body frame [point, 3] [m]."""
+        middle, _, moving = self.supports()
+        return np.array([middle + one.offset(normal) for one in moving]) if moving else self.ground_points()[0]
 
     def surface_points(self, most: int) -> np.ndarray:
         """Return points of a source's shape [point, 3], at most ``most`` where there is a choice."""
@@ -347,35 +368,82 @@ class BoxShape(ContactShape):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CylinderShape(ContactShape):
-    """A cylinder along z of its placement: a hull of points on both rims, as many on one as on the other."""
+    """All points between two rims, grown by a margin.
 
-    radius: float
-    half: float
-    place: Placement
+    Attributes:
+        ends: middles of the rims [2, 3]. radii: of both. margin: by which the surface lies outside [m].
+        most: points that touch the ground, two to four.
+    """
+
+    ends: np.ndarray
+    radii: tuple[float, float]
+    margin: float = 0.0
+    most: int = 4
 
     kind = "cylinder"
     names: ClassVar[Names] = {"newton": ("CYLINDER",), "mujoco": ("CYLINDER",), "urdf": ("cylinder",)}
     sizes = ("radius", "half_length")
 
     @classmethod
-    def from_sizes(cls, sizes: Any, place: Placement) -> ContactShape:
-        radius, half = sizes
-        return cls(radius, half, place)
+    def parse(cls, call: str, value: Any) -> ContactShape:
+        if isinstance(value, cls):
+            return value
+        *ends, radius = _parts(call, cls.kind, value, 3, "((x, y, z), (x, y, z), radius)")
+        found = [checked_array(call, f"an end [m] of {cls.kind}", end, (3,)) for end in ends]
+        if not np.linalg.norm(found[1] - found[0]) > 0.0:
+            raise ValueError(f"{call}: both ends of {cls.kind} are {found[0].tolist()} m; expected two places")
+        return cls(read_only(np.array(found)), cls._radii(_radius(call, cls.kind, radius)))
 
-    def surface_points(self, most: int) -> np.ndarray:
-        ring = _ring(max(1, most // 2), self.radius)
-        return self.place.points(np.concatenate([ring + np.array([0.0, 0.0, z]) for z in (self.half, -self.half)]))
+    @staticmethod
+    def _radii(radius: float) -> tuple[float, float]:
+        return radius, radius
+
+    @classmethod
+    def from_sizes(cls, sizes: Any, place: Placement) -> ContactShape:
+        radius, half = map(float, sizes)
+        least = max(half, ROUNDING * max(radius, 1.0))  # a disc has an axis, too
+        return cls(place.points([[0.0, 0.0, -least], [0.0, 0.0, least]]), cls._radii(radius))
+
+    def arguments(self) -> dict[str, Any]:
+        return {self.kind: self}
+
+    def _frame(self) -> tuple[np.ndarray, float]:
+        """Return the axes, one a row, and half the length."""
+        half = (self.ends[1] - self.ends[0]) / 2.0
+        length = float(np.linalg.norm(half))
+        axis = half / length
+        across = np.eye(3)[np.abs(axis).argmin()]
+        first = np.cross(across, axis) / np.linalg.norm(np.cross(across, axis))
+        return np.array([first, np.cross(axis, first), axis]), length
+
+    def supports(self) -> tuple[np.ndarray, float, list[Support]]:
+        (axes, half), (bottom, top) = self._frame(), self.radii
+        rows = tuple(map(tuple, axes.tolist()))
+        found = [Support(RIM, rows, (top, bottom, half), number) for number in range(max(2, min(4, self.most)))]
+        return self.ends.mean(axis=0), self.margin, found
+
+    def ground_points(self) -> tuple[np.ndarray, float]:
+        axes, _ = self._frame()
+        rims = [end + _ring(RING, radius) @ axes for end, radius in zip(self.ends, self.radii, strict=True)]
+        return np.concatenate(rims), self.margin
+
+    def on_ground(self, margin: float, most: int) -> list[ContactShape]:
+        return [dataclasses.replace(self, margin=self.margin + margin, most=most)]
+
+    def primitive(self, least: float) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
+        segment, radius = _swept_segment(self.ends[0], self.ends[1], 0.0), max(*self.radii, FLAT)
+        return "box", (radius, radius, max(float(segment.size[2]), FLAT)), tuple(segment.pose.tolist())
 
 
 class ConeShape(CylinderShape):
-    """A cone: a hull of the tip, at +z of its placement, and of points on the rim."""
+    """A cone: a cylinder whose second end, at +z of a source's placement, is the tip."""
 
     kind = "cone"
     names: ClassVar[Names] = {"newton": ("CONE",)}
 
-    def surface_points(self, most: int) -> np.ndarray:
-        tip = np.array([0.0, 0.0, self.half])
-        return self.place.points(np.concatenate([tip[None], _ring(max(1, most - 1), self.radius) - tip]))
+    @staticmethod
+    def _radii(radius: float) -> tuple[float, float]:
+        return radius, 0.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -445,18 +513,50 @@ class HullShape(ContactShape):
         return "box", tuple(np.maximum(0.5 * (high - low), FLAT).tolist()), (*middle, *IDENTITY_POSE[3:])
 
 
-class EllipsoidShape(HullShape):
-    """An ellipsoid: the hull of points on its surface."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class EllipsoidShape(ContactShape):
+    """An ellipsoid of half its axes (3,), with a pose in the body [7], grown by a margin [m]."""
+
+    half: np.ndarray
+    pose: Any
+    margin: float = 0.0
 
     kind = "ellipsoid"
     names: ClassVar[Names] = {"newton": ("ELLIPSOID",), "mujoco": ("ELLIPSOID",)}
     sizes = ("half_x", "half_y", "half_z")
-    pairs = lends_margin = False
+
+    @classmethod
+    def parse(cls, call: str, value: Any) -> ContactShape:
+        if isinstance(value, cls):
+            return value
+        count = 3 if np.ndim(_first(value)) == 0 else 2
+        parts = _parts(call, "ellipsoid", value, count, "half its axes, or (those, its pose)")
+        sizes, pose = (parts, IDENTITY_POSE) if len(parts) == 3 else parts
+        half = checked_array(call, "half the axes [m] of ellipsoid", sizes, (3,))
+        if not (half > 0.0).all():
+            raise ValueError(f"{call}: half the axes of ellipsoid are {half.tolist()} m; expected more than zero each")
+        return cls(half, checked_pose(call, "the pose of ellipsoid", pose))
 
     @classmethod
     def from_sizes(cls, sizes: Any, place: Placement) -> ContactShape:
-        axes = np.asarray(sizes, dtype=np.float64)
-        return cls(axes * np.concatenate([np.eye(3), -np.eye(3), spread_directions(SPREAD)]), place)
+        return cls(np.asarray(sizes, dtype=np.float64), place.pose)
+
+    def arguments(self) -> dict[str, Any]:
+        return {"ellipsoid": self}
+
+    def supports(self) -> tuple[np.ndarray, float, list[Support]]:
+        axes = tuple(map(tuple, pose_matrix(self.pose)[:3, :3].T.tolist()))
+        return np.asarray(self.pose)[:3], self.margin, [Support(SURFACE, axes, tuple(self.half.tolist()), 0)]
+
+    def ground_points(self) -> tuple[np.ndarray, float]:
+        around = self.half * np.concatenate([np.eye(3), -np.eye(3), spread_directions(SPREAD)])
+        return Placement(self.pose).points(around), self.margin
+
+    def on_ground(self, margin: float, most: int) -> list[ContactShape]:
+        return [dataclasses.replace(self, margin=self.margin + margin)]
+
+    def primitive(self, least: float) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
+        return "box", tuple(np.maximum(self.half, FLAT).tolist()), tuple(np.asarray(self.pose).tolist())
 
 
 SHAPES: Mapping[str, type[ContactShape]] = {

@@ -39,13 +39,12 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
         found = pair_values(pair, scene, stand)
         for name, value in zip(CONTACT_VALUES, found, strict=False):
             values[name][0, i] = value
-    at = np.array([stand.at(point) for point in points]).reshape(-1, 3)
     bodies = np.array([point.body for point in points], dtype=int)
-    radii = np.array([point.radius for point in points])
-    sinks = {
-        body: stand.sink(body, at[bodies == body], radii[bodies == body].max())
-        for body in dict.fromkeys(bodies.tolist())
-    }
+    sinks = {}
+    for body in dict.fromkeys(bodies.tolist()):
+        mine = [contact for contact in scene.contacts if contact.other is None and contact.body == body]
+        at = stand.on(body, np.concatenate([contact.positions for contact in mine]))
+        sinks[body] = stand.sink(body, at, max(contact.radius for contact in mine))
     for i, point in enumerate(points):
         contact, load, mass = scene.contacts[point.contact], *stand.load(point.body)
         rests = min(POINTS_AT_REST, int((stand.roots == stand.roots[point.body])[bodies].sum()))

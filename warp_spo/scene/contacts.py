@@ -12,6 +12,7 @@ from ..errors import UnsupportedError, as_integer, quoted
 from .checks import checked_array, read_only
 from .contact_shapes import ARGUMENTS, SHAPES, ContactShape, ShapeArguments
 from .ground import HeightField, Listed, Plane
+from .supports import Support
 
 FRICTIONS = ("friction", "torsional_friction", "rolling_friction")
 """Arguments of a Contact that bound friction."""
@@ -74,8 +75,9 @@ class Contact(ShapeArguments):
     walls: bool = True
     label: str = ""
     shape: ContactShape = dataclasses.field(init=False, repr=False)
-    positions: np.ndarray = dataclasses.field(init=False, repr=False)  # of the points, in the body frame [point, 3]
+    positions: np.ndarray = dataclasses.field(init=False, repr=False)  # on the shape, in the body frame [position, 3]
     radius: float = dataclasses.field(init=False, repr=False)  # of the sphere about each
+    placements: tuple[tuple[Any, Support | None], ...] = dataclasses.field(init=False, repr=False)  # as of ContactPoint
 
     def __post_init__(self) -> None:
         call = f"Contact({quoted(self.label)})" if self.label else "Contact"
@@ -97,6 +99,11 @@ class Contact(ShapeArguments):
         object.__setattr__(self, "shape", shape)
         object.__setattr__(self, "positions", read_only(positions))
         object.__setattr__(self, "radius", radius)
+        middle, _, moving = shape.supports()
+        placements = [(tuple(middle.tolist()), support) for support in moving]
+        object.__setattr__(
+            self, "placements", tuple(placements or ((tuple(place), None) for place in positions.tolist()))
+        )
 
 
 class ContactPoint(NamedTuple):
@@ -105,6 +112,7 @@ class ContactPoint(NamedTuple):
     Attributes:
         contact: index of its contact in ``Scene.contacts``. body: index of its body.
         position: of the point, or of the centre of its sphere, in the body frame [m]. radius: of the sphere, or 0 [m].
+        support: how the point moves over a shape with its middle at ``position``, as the body turns; None: it does not.
         eps: speed below which friction is a damper [m/s]. dissipates: its damping grows with the depth. walls: it sees
             walls of a height field. is_slow: deep in the ground it comes out at PUSH_OUT at most.
     """
@@ -117,6 +125,12 @@ class ContactPoint(NamedTuple):
     dissipates: bool = False
     walls: bool = True
     is_slow: bool = False
+    support: Support | None = None
+
+    def place(self, normal: Any) -> np.ndarray:
+        """Return where the point is, or the centre of its sphere, in the body frame [m]; ``normal`` of the ground."""
+        position = np.asarray(self.position)
+        return position if self.support is None else position + self.support.offset(normal)
 
 
 def contact_points(contacts: Sequence[Contact]) -> tuple[ContactPoint, ...]:
@@ -125,16 +139,17 @@ def contact_points(contacts: Sequence[Contact]) -> tuple[ContactPoint, ...]:
         ContactPoint(
             index,
             contact.body,
-            (x, y, z),
+            place,
             contact.radius,
             contact.eps,
             contact.dissipation is not None,
             contact.walls,
             contact.damping is None and contact.dissipation is None,
+            support,
         )
         for index, contact in enumerate(contacts)
         if contact.other is None
-        for x, y, z in contact.positions.tolist()
+        for place, support in contact.placements
     )
 
 

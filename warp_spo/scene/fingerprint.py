@@ -21,13 +21,15 @@ PLACES = (-0.7, -0.2, 0.1, 0.6)  # where a function of coordinates is sampled
 def fingerprint(scene: Scene, variable: Collection[str] = ()) -> str:
     """Return 64 hexadecimal digits of what decides the kernels of a scene: its structure and the values that fold.
 
-    Labels do not count, nor do heights of the ground, but for whether some cell has a wall, nor the numbers of values
-    that are ``variable`` or differ between worlds. A function of the user's counts by what it returns at a few points.
+    Labels do not count, nor do heights of the ground, but for whether there are walls or creases, nor the numbers of
+    values that are ``variable`` or differ between worlds. A function of the user's counts by what it returns at a few
+    points.
     """
     digest = hashlib.sha256()
     ground: Any = scene.ground
     if isinstance(ground, HeightField):  # its heights are a table
-        ground = (ground.heights.shape, ground.cell, ground.origin, HEIGHTS not in variable and ground.has_walls)
+        walls = HEIGHTS not in variable and ground.has_walls
+        ground = (ground.heights.shape, ground.cell, ground.origin, walls, ground.has_creases)
     for hinge in scene.hinges:
         _feed(digest, [getattr(hinge, name) for name in HINGE])
         if hinge.pose is not None:

@@ -13,6 +13,7 @@ from .pickling import StoredPart
 HEIGHTS = "ground_heights"
 GROUND_VALUES = ("ground_origin", "ground_field", "contact_place", HEIGHTS)
 """Names of a scene's values that come from its ground."""
+CREASE = 1.19  # tangent of the angle, 50 degrees, by which a field's slope rises at a crease
 STEEP = 1.0  # slope beyond which a cell of a height field is a wall and a floor
 AWAY = -1e3  # depth of a surface that is not there [m]; no step reaches so far
 PLACE = 7  # numbers of a point in the value contact_place
@@ -103,6 +104,16 @@ class HeightField(StoredPart):
         twist = low - right - far + corner
         x, y = right - low + 0.5 * twist, far - low + 0.5 * twist
         return bool((np.hypot(x, y * (cell_x / cell_y)) > STEEP * cell_x).any())
+
+    @property
+    def has_creases(self) -> bool:
+        """Whether the field folds upward so much, from one cell to the next, that a sphere may touch both sides."""
+        for axis, cell in zip((-2, -1), self.cells, strict=True):
+            slopes = np.moveaxis(np.diff(self.heights, axis=axis), axis, -1) * (1.0 / cell)
+            before, after = slopes[..., :-1], slopes[..., 1:]
+            if (after - before > CREASE * np.maximum(1.0 + before * after, 0.0)).any():
+                return True
+        return False
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -67,7 +67,8 @@ def forces(
     found = []
     for point, vector in zip(scene.contact_points, vectors, strict=True):
         pose = poses[point.body]
-        start = pose[:3] + rotation(pose[3:]) @ point.position - (0.0, 0.0, point.radius)
+        turn = rotation(pose[3:])
+        start = pose[:3] + turn @ point.place(turn[2]) - (0.0, 0.0, point.radius)
         start = start + (point.radius + radius) * side
         if np.linalg.norm(vector) > radius:
             found.append(capsule(-1, start, start + vector, radius, FORCE))

@@ -3,7 +3,7 @@
 A plane has one normal. A height field is bilinear in each cell: the depth is (H - z) n_z with the normal n of the field
 under the point, held over the step. Where a cell is steeper than STEEP, the point has two surfaces instead: the wall,
 which is the cell's plane and ends at its highest corner, and the floor, which is flat at the height of its lowest one.
-A point that the step takes into such a cell has its wall already.
+A point that the step takes into such a cell has its wall already. Spheres on a field are in :mod:`.field_spheres`.
 """
 
 from __future__ import annotations
@@ -106,6 +106,18 @@ def surfaces(
     return [bottom, Surface(wall, select(there, (middle - z) * wall[2], AWAY), cell, there)]
 
 
+def upward(graph: Graph, ground: HeightField, at: list[Value], place: GroundOffset) -> Vector:
+    """Return the normal of a field over or under a place, the vertical where its cell is steep."""
+    rows, columns = ground.heights.shape[-2:]
+    rate_x, rate_y = (1.0 / cell for cell in ground.cells)
+    i, s = _cell((at[0] - place.origin[0] - ground.origin[0]) * rate_x, rows)
+    j, t = _cell((at[1] - place.origin[1] - ground.origin[1]) * rate_y, columns)
+    cell = Corners.of(graph, ground, place, i, j)
+    smooth = _facing((cell.run + cell.twist * t) * rate_x, (cell.rise + cell.twist * s) * rate_y)
+    steep = less(STEEP * STEEP, cell.steepness(rate_x, rate_y))
+    return Vector(select(steep, a, b) for a, b in zip(IDENTITY[2], smooth, strict=True))
+
+
 class Corners(NamedTuple):
     """The heights at the corners of a cell, and the number of the first one, row after row, field after field."""
 
@@ -126,7 +138,7 @@ class Corners(NamedTuple):
         rows, columns = ground.heights.shape[-2:]
         first = i * float(columns) + j
         if ground.count > 1:
-            first = floor(_clamp(place.field, ground.count - 1.0)) * float(rows * columns) + first
+            first = floor(clamp(place.field, ground.count - 1.0)) * float(rows * columns) + first
         if together:
             h00, h01, h10, h11 = lookup(graph, GROUND, first, CORNERS)
         else:
@@ -214,13 +226,13 @@ def height(
 
 def _cell(x: Value, points: int) -> tuple[Value, Value]:
     """Return the cell of a place in cells, and how far in it the place is; the last cell beyond the edges."""
-    x = _clamp(x, points - 1.0)
+    x = clamp(x, points - 1.0)
     cell = floor(x)
     cell = select(less(cell, points - 1.5), cell, points - 2.0)
     return cell, x - cell
 
 
-def _clamp(x: Value, most: float) -> Value:
+def clamp(x: Value, most: float) -> Value:
     """Return a number between zero and ``most``, so that no table is read beyond its end; NaN becomes zero."""
     x = select(less(0.0, x), x, 0.0)
     return select(less(x, most), x, most)
@@ -232,12 +244,14 @@ def _facing(slope_x: Value, slope_y: Value) -> Vector:
     return Vector((-(slope_x * size), -(slope_y * size), size))
 
 
-def surface_count(ground: Plane | HeightField | Listed | None, varies: bool, walls: bool) -> int:
+def surface_count(ground: Plane | HeightField | Listed | None, varies: bool, walls: bool, sphere: bool) -> int:
     """Return how many surfaces a point may touch.
 
-    ``varies``: the heights of a field are variable. ``walls``: as for :func:`surfaces`.
+    ``varies``: the heights of a field are variable. ``walls``: as for :func:`surfaces`. ``sphere``: it touches a field
+    as one.
     """
-    return 2 if walls and has_walls(ground, varies) else 1
+    creased = sphere and isinstance(ground, HeightField) and ground.has_creases
+    return 2 if walls and (creased or has_walls(ground, varies)) else 1
 
 
 def has_walls(ground: Plane | HeightField | Listed | None, varies: bool) -> bool:

@@ -43,7 +43,9 @@ from ..model.tracing import Trace
 from ..motion import VelocityTerms, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
 from ..step.joint_laws import is_number
-from .ground import Corners, GroundOffset, Surface, directions, lowest, surface_count, surfaces
+from .field_spheres import ring, sphere_surfaces
+from .ground import Corners, GroundOffset, Surface, directions, lowest, surface_count, surfaces, upward
+from .supports import SupportPlacement, place_support
 from .turning import TurningFriction, turning_names, turning_scales
 from .velocity_kicks import KICK, PATH
 
@@ -181,25 +183,44 @@ def place_points(
             radius, eps, weight = trace.links.shared_constants.of_point(number, "contact", (radius, eps, weight))
         trace.graph.step = f"contact {number}|c"
         toward = mine.axes[:count]
-        arm = centre if is_number(radius, 0.0) else centre - toward[lowest(ground)] * radius
+        rolls = meets_field_as_sphere(ground, point)
+        down = toward[lowest(ground)]
         lever = radius + total(absolute(x) for x in centre)
-        at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
-        at[lowest(ground)] = at[lowest(ground)] - radius
+        hub, more = centre, None
+        if point.support is not None:
+            if isinstance(ground, HeightField):
+                at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
+                up = upward(trace.graph, ground, at, place_of_ground)
+                down = Vector(total(n * axis[c] for n, axis in zip(up, toward, strict=True)) for c in range(3))
+            placed = _place_support(trace, number, down)
+            lever, more = lever + point.support.reach, placed.bend(mine.travel, mine.bend)
+            centre, hub = centre + placed.offset, centre + placed.hub
+        arm = centre if rolls or is_number(radius, 0.0) else centre - down * radius
+        place = centre if point.support is None else arm
+        at = [origin + dot(axis, place) for origin, axis in zip(mine.origins, toward, strict=True)]
+        if not rolls and point.support is None:
+            at[lowest(ground)] = at[lowest(ground)] - radius
         k, d, mu = (joint_laws.value(f"contact_{name}", number) for name in ("stiffness", "damping", "friction"))
         turned = mine.axes[-len(IDENTITY) :] if oriented else []
         turning = _turning_friction(joint_laws, number, eps)
         h, moving = joint_laws.h, mine.motion
-        bend = mine.bend[1] + cross(mine.bend[0], centre)
-        bend = bend if moving is None else bend + moving.whirl @ centre
+        bend = mine.bend[1] + cross(mine.bend[0], hub)
+        bend = bend if moving is None else bend + moving.whirl @ hub
         w, v = mine.travel
         ahead = 0.5 * h if half_way else h
         moves = [ahead * dot(axis, v + cross(w, centre)) for axis in toward]
-        touched = [_listed_surface(joint_laws, number)] if isinstance(ground, Listed) else None
-        for normal, depth, cell, near in touched or surfaces(
-            trace.graph, ground, at, place_of_ground, moves, point.walls
-        ):
+        if isinstance(ground, Listed):
+            touched = [_listed_surface(joint_laws, number)]
+        elif rolls and isinstance(ground, HeightField):
+            second = surface_count(ground, place_of_ground.varies, point.walls, rolls) == 2
+            cells = ring(ground, point.radius)
+            touched = sphere_surfaces(trace.graph, ground, at, place_of_ground, radius, cells, second)
+        else:
+            touched = surfaces(trace.graph, ground, at, place_of_ground, moves, point.walls)
+        for normal, depth, cell, near in touched:
             inward = Vector(total(n * axis[c] for n, axis in zip(normal, toward, strict=True)) for c in range(3))
-            faster = h * dot(inward, bend)
+            arm = centre - inward * radius if rolls else arm
+            faster = h * (dot(inward, bend) if more is None else dot(inward, bend) + more)
             if half_way:  # half a step back, along a parabola
                 depth = depth + (0.5 * h) * dot(inward, v + cross(w, arm)) - (0.125 * h) * faster
             below = depth if half_way else depth - (0.5 * h) * faster
@@ -262,9 +283,31 @@ def _carry_outward(
 
 def surface_numbers(scene: Scene, varies: bool) -> list[range]:
     """Return the numbers of the surfaces that each contact point may touch; ``varies``: heights are variable."""
-    counts = [surface_count(scene.ground, varies, point.walls) for point in scene.contact_points]
+    counts = [
+        surface_count(scene.ground, varies, point.walls, meets_field_as_sphere(scene.ground, point))
+        for point in scene.contact_points
+    ]
     ends = itertools.accumulate(counts)
     return [range(end - count, end) for end, count in zip(ends, counts, strict=True)]
+
+
+def meets_field_as_sphere(ground: Any, point: ContactPoint) -> bool:
+    """Return whether a point is a sphere that touches where a height field is nearest."""
+    return isinstance(ground, HeightField) and point.radius > 0.0 and point.support is None
+
+
+def _place_support(trace: Trace, number: int, normal: Vector) -> SupportPlacement:
+    """Return where a point is that moves over its shape; ``normal`` of the ground in the axes of the point's link."""
+    point, constants = trace.links.scene.contact_points[number], trace.links.shared_constants
+    assert point.support is not None
+    turn = trace.links.placements[point.body].matrix @ trace.links.nodes[point.body].anchor[0].T
+    axes: list[Value] = [x for axis in point.support.axes for x in turn @ Vector(axis)]
+    sizes: list[Value] = list(point.support.sizes)
+    if constants is not None:
+        if all(map(is_constant, axes)):
+            axes = constants.of_point(number, "axes", axes)
+        sizes = constants.of_point(number, "sizes", sizes)
+    return place_support(point.support, [Vector(axes[i : i + 3]) for i in (0, 3, 6)], sizes, normal)
 
 
 def point_links(links: Links) -> list[Link | None]:

@@ -89,7 +89,7 @@ class ContactStepTrace(Step):
         self._group_points(points, states, candidates)
         arms = keeps_arms(trace)
         phases.add_invariants(bias.values())
-        phases.add_invariants(value for point in points for value in point.kept_values(arms))
+        phases.add_invariants(value for point in points for value in point.kept_values(arms or self._moves(point)))
         phases.add_invariants(value for group in self.cull_groups.values() for value in (group.highest, group.reach))
         terms, tau = self._step_terms(points, states), trace.vector("tau")
         done, rates, sent = self.inward(terms, lambda dof: tau(dof) + self.forces[dof] - bias[dof])
@@ -220,6 +220,10 @@ class ContactStepTrace(Step):
         return self.h * reciprocal(select(less(least, felt), felt, least))
 
     # -- contacts --------------------------------------------------------------------------------------------------
+    def _moves(self, point: TracedContactPoint) -> bool:
+        """Return whether a point moves over its shape, so that its arm takes more than three operations."""
+        return self.trace.links.scene.contact_points[point.number].support is not None
+
     def _group_points(
         self, points: list[TracedContactPoint], states: list[PointState], candidates: list[Value]
     ) -> None:

@@ -1,0 +1,150 @@
+"""Spheres on a height field: the nearest points of the surface to the centre, and the normals there.
+
+A sphere touches where the surface is nearest to its centre c, in the direction from there to c. The cells around the
+grid point nearest to c are tried, two along each axis, or four where the radius is large beside the cell. In each the
+nearest point of its bilinear surface is found by Gauss and Newton from the place next to c: with slopes g and the
+height's error w there, the move u of least |e - u|^2 + (w - g . u)^2, where e leads to c, kept inside of the cell. The
+nearest cell's point is found again, with a step more, so that its derivatives are those of that cell's heights alone.
+
+Where a field has walls or creases a sphere may touch a second point: the nearest one that lies in another direction.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+from ...scene.ground import AWAY, HeightField
+from ...trace.scalars import Graph, Value, floor, inverse_root, less, reciprocal, select
+from ...trace.spatial import Vector, dot
+from .ground import Corners, GroundOffset, Surface, clamp
+
+STEPS = 2  # of Gauss and Newton in each cell; the nearest one takes one more
+REACH = 0.71  # sine of the steepest slope, 45 degrees, whose nearest point is among the cells for sure
+APART = 0.94  # cosine of the angle beyond which a second point counts: 20 degrees
+NOWHERE = 1e12  # square of a distance [m^2] beyond all others
+TINY = 1e-20  # square of a distance [m^2] that has no direction
+
+
+class Cell(NamedTuple):
+    """A cell of a field.
+
+    Attributes:
+        corners: its heights. x, y: of the sphere's centre, from its first corner [m].
+    """
+
+    corners: Corners
+    x: Value
+    y: Value
+
+
+class Foot(NamedTuple):
+    """The nearest point of a cell.
+
+    Attributes:
+        away: from there to the centre [m]. square: of that distance. outside: whether the centre is above the surface.
+    """
+
+    away: Vector
+    square: Value
+    outside: Value
+
+
+def ring(ground: HeightField, radius: float) -> int:
+    """Return how many cells to each side of the nearest grid point are tried for a sphere."""
+    return 1 if REACH * radius <= 0.5 * min(ground.cells) else 2
+
+
+def sphere_surfaces(
+    graph: Graph,
+    ground: HeightField,
+    centre: list[Value],
+    place: GroundOffset,
+    radius: Value,
+    cells: int,
+    second: bool,
+) -> list[Surface]:
+    """Return the surfaces that a sphere may touch, ``centre`` in inertial axes [m].
+
+    ``cells``: see :func:`ring`. ``second``: whether there may be two.
+    """
+    (size_x, size_y), (rows, columns) = ground.cells, ground.heights.shape[-2:]
+    z = centre[2] - place.origin[2] - ground.origin[2]
+    along_x = _indices(centre[0] - place.origin[0] - ground.origin[0], size_x, rows, cells)
+    along_y = _indices(centre[1] - place.origin[1] - ground.origin[1], size_y, columns, cells)
+    found = [
+        Cell(Corners.of(graph, ground, place, i, j), x, y) for (i, x), (j, y) in itertools.product(along_x, along_y)
+    ]
+    feet = [_foot(cell, z, size_x, size_y, STEPS) for cell in found]
+    nearest, _ = _least(found, [foot.square for foot in feet])
+    foot = _foot(nearest, z, size_x, size_y, STEPS + 1)
+    surface = _surface(nearest, foot, radius, 1.0 if second else None)
+    if not second:
+        return [surface]
+    squares = []
+    for other in feet:
+        turned = dot(other.away, foot.away)
+        apart = less(turned, 0.0) + less(turned * turned, (APART * APART) * (other.square * foot.square))
+        squares.append(select(apart * other.outside, other.square, NOWHERE))
+    beside, least = _least(found, squares)
+    there = foot.outside * less(least, NOWHERE)
+    return [surface, _surface(beside, _foot(beside, z, size_x, size_y, STEPS + 1), radius, there)]
+
+
+def _indices(at: Value, size: float, points: int, cells: int) -> list[tuple[Value, Value]]:
+    """Return the numbers of the cells along an axis that are tried, and where the centre is in each [m]."""
+    at = clamp(at * (1.0 / size), points - 1.0)
+    middle, last = floor(at + 0.5), points - 2.0
+    found = [clamp(middle + float(step), last) for step in range(-cells, cells)]
+    return [(cell, (at - cell) * size) for cell in found]
+
+
+def _foot(cell: Cell, z: Value, size_x: float, size_y: float, steps: int) -> Foot:
+    """Return the nearest point of a cell to a centre at the height ``z``."""
+    corners, x, y = cell
+    run, rise = corners.run * (1.0 / size_x), corners.rise * (1.0 / size_y)
+    twist, above = corners.twist * (1.0 / (size_x * size_y)), z - corners.base
+    s, t = clamp(x, size_x), clamp(y, size_y)
+    for step in range(steps):
+        a, b = run + twist * t, rise + twist * s
+        w = above - run * s - b * t
+        right_x, right_y = (x - s) + a * w, (y - t) + b * w
+        along_x, along_y = a * a + 1.0, b * b + 1.0
+        both = a * b
+        inverse = reciprocal(along_x + b * b)
+        if step % 2 == 0:
+            next_s = clamp(s + (along_y * right_x - both * right_y) * inverse, size_x)
+            t = clamp(t + (right_y - both * (next_s - s)) * reciprocal(along_y), size_y)
+            s = next_s
+        else:
+            next_t = clamp(t + (along_x * right_y - both * right_x) * inverse, size_y)
+            s = clamp(s + (right_x - both * (next_t - t)) * reciprocal(along_x), size_x)
+            t = next_t
+    a, b = run + twist * t, rise + twist * s
+    away = Vector((x - s, y - t, above - run * s - b * t))
+    return Foot(away, dot(away, away), less(0.0, away[2] - a * away[0] - b * away[1]))
+
+
+def _least(cells: list[Cell], squares: list[Value]) -> tuple[Cell, Value]:
+    """Return the cell of the least square, of equal ones the first, and that square."""
+    (corners, x, y), least = cells[0], squares[0]
+    for other, square in zip(cells[1:], squares[1:], strict=True):
+        nearer = less(square, least)
+        corners = Corners(*(select(nearer, a, b) for a, b in zip(other.corners, corners, strict=True)))
+        x, y = select(nearer, other.x, x), select(nearer, other.y, y)
+        least = select(nearer, square, least)
+    return Cell(corners, x, y), least
+
+
+def _surface(cell: Cell, foot: Foot, radius: Value, near: Value | None) -> Surface:
+    """Return the surface at the nearest point; a centre inside of the ground leaves it the shortest way."""
+    known = less(TINY, foot.square)
+    inverse = inverse_root(select(known, foot.square, 1.0))
+    sign = select(foot.outside, 1.0, -1.0)
+    outward = sign * inverse
+    x, y, z = (outward * part for part in foot.away)
+    normal = Vector((select(known, x, 0.0), select(known, y, 0.0), select(known, z, 1.0)))
+    depth = radius - sign * (select(known, foot.square, 0.0) * inverse)
+    if near is None or near == 1.0:
+        return Surface(normal, depth, cell.corners, near)
+    return Surface(normal, select(near, depth, AWAY), cell.corners, near)

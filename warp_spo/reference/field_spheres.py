@@ -1,0 +1,63 @@
+"""The specification of a sphere on a height field: nearest points of cells, found by a fixed number of steps."""
+
+import numpy as np
+
+STEPS, REACH, APART = 2, 0.71, 0.94  # steps in a cell; sine of 45 degrees; cosine of 20 degrees
+
+
+def nearest_points(field, centre, radius, number=0, both=True):
+    """Return normal and depth of one or two surfaces of a field that a sphere may touch; ``centre`` [m].
+
+    The first is at the nearest point of the cells around the grid point next to the centre, two along each axis, or
+    four if ``radius`` is more than 0.7 cells. ``both``: the second is at the nearest point in a direction that differs
+    by more than 20 degrees, unless the centre is below the surface. Of a set of fields it is that of this number.
+    """
+    h, cell = field.heights.reshape(-1, *field.heights.shape[-2:])[number], np.array(field.cells)
+    at = np.clip((centre[:2] - np.array(field.origin[:2])) / cell, 0.0, np.array(h.shape) - 1.0)
+    z, middle = centre[2] - field.origin[2], np.floor(at + 0.5)
+    cells = 1 if REACH * radius <= 0.5 * cell.min() else 2
+    found = []
+    for i in range(-cells, cells):
+        for j in range(-cells, cells):
+            first = np.clip(middle + np.array((i, j)), 0, np.array(h.shape) - 2).astype(int)
+            corners = h[first[0] : first[0] + 2, first[1] : first[1] + 2]
+            found.append((corners, (at - first) * cell))
+    feet = [_foot(*each, z, cell, STEPS) for each in found]
+    best = int(np.argmin([away @ away for away, _ in feet]))
+    surfaces = [_foot(*found[best], z, cell, STEPS + 1)]
+    away, above = surfaces[0]
+    far = [
+        other @ other if up and other @ away < APART * np.linalg.norm(other) * np.linalg.norm(away) else np.inf
+        for other, up in feet
+    ]
+    if both and above and np.isfinite(min(far)):
+        surfaces.append(_foot(*found[int(np.argmin(far))], z, cell, STEPS + 1))
+    signed = [(up if above else -up, np.linalg.norm(up) if above else -np.linalg.norm(up)) for up, above in surfaces]
+    return [(up / abs(distance), radius - distance) for up, distance in signed]
+
+
+def _foot(corners, inside, z, cell, steps):
+    """Return the vector from the nearest point of a cell to the centre, and whether that is above the surface.
+
+    ``inside``: x and y of the centre from the first corner [m].
+    """
+
+    def surface(p):
+        s, t = p / cell
+        height = np.array([1.0 - s, s]) @ corners @ np.array([1.0 - t, t])
+        slope = np.array([np.array([1.0 - t, t]) @ (corners[1] - corners[0]),
+                          np.array([1.0 - s, s]) @ (corners[:, 1] - corners[:, 0])]) / cell  # fmt: skip
+        return height, slope
+
+    p = np.clip(inside, 0.0, cell)
+    for step in range(steps):
+        height, slope = surface(p)
+        A, b = np.eye(2) + np.outer(slope, slope), inside - p + (z - height) * slope
+        one, other = (0, 1) if step % 2 == 0 else (1, 0)
+        move = np.zeros(2)
+        move[one] = np.clip(p[one] + np.linalg.solve(A, b)[one], 0.0, cell[one]) - p[one]
+        move[other] = (b[other] - A[other, one] * move[one]) / A[other, other]
+        p = np.clip(p + move, 0.0, cell)
+    height, slope = surface(p)
+    away = np.array([*(inside - p), z - height])
+    return away, away[2] > slope @ away[:2]
