@@ -67,7 +67,7 @@ def test_a_tilted_field_is_a_tilted_plane():
 def test_a_ball_in_a_groove_rests_on_both_sides():
     """A V of 40 degrees: it sinks by m g / (2 k cos^2 40) along z, and stays in the middle."""
     field, _ = shapes.fields()["V of 40 degrees"]
-    scene = shapes.ball_on(field, 0.04, friction=0.3, stiffness=1e4)
+    scene = shapes.ball_on(field, 0.04, friction=0.0, stiffness=1e4)  # friction would let it creep down
     q = [1e-4, 0.01, 0.04 / np.cos(np.radians(40.0)), 0.0, 0.0, 0.0, 1.0]
     states = shapes.rolled(scene, q, np.zeros(6), 5e-3, 0.5)
     sink = 0.04 / np.cos(np.radians(40.0)) - states[-1, 2]

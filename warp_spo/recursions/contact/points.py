@@ -226,7 +226,7 @@ def place_points(
             below = depth if half_way else depth - (0.5 * h) * faster
             damping = d * (k * select(less(0.0, depth), depth, 0.0)) if point.dissipates else d
             deep: Value = 0.0
-            if point.is_slow and touched is None:
+            if point.is_slow and not isinstance(ground, Listed):
                 slow = k * (below * (1.0 / PUSH_OUT) - h)  # at PUSH_OUT the force is zero
                 deep = less(damping, slow)
                 damping = select(deep, slow, damping)
