@@ -10,8 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from ..errors import shown
+from .compile.guard import BEYOND, NOT_FINITE
+
 if TYPE_CHECKING:
     from .environment import Env
+
+KINDS_OF_FAULTS = (f"/{NOT_FINITE}/", f"/{BEYOND}/")  # beginnings of names in a log
 
 
 class TimeLimitReached(Exception):
@@ -32,6 +37,7 @@ class TrainingLog:
         self.ends = began + seconds
         self.writer = self if folder is not None and writes else None
         self.first = 0  # iteration
+        self.faults: dict[str, float] = {}  # what ended worlds so far, as printed
         self.rows: list[dict[str, float]] = []
         self.git_status_repos: list[str] = []
 
@@ -70,15 +76,27 @@ class TrainingLog:
         row["reward"] = sum(value for name, value in row.items() if name.startswith("/reward/"))
         self.rows.append(row)
         with self.file.open("a") as file:
-            file.write(json.dumps({name: float(f"{value:.6g}") for name, value in row.items()}) + "\n")
+            empty = {name for name, x in row.items() if not x and name.startswith(KINDS_OF_FAULTS)}
+            kept = {name: x for name, x in row.items() if name not in empty or name.count("/") < 3}
+            file.write(json.dumps({name: float(f"{value:.6g}") for name, value in kept.items()}) + "\n")
         if it % self.every == 0 or it + 1 == total_it:
             reward = f"{row['reward']:8.3f}" if row["/episode/finished"] else f"{'-':>8}"
             length = f"{row['/episode/seconds']:5.1f}" if row["/episode/whole"] else f"{'-':>5}"
             print(f"iteration {it:4d} of {total_it}  {row['seconds']:6.1f} s  reward {reward}  "
                   f"episode {length} s  collecting {1e3 * collect_time:4.0f} ms  "
                   f"learning {1e3 * learn_time:4.0f} ms", flush=True)  # fmt: skip
+            self._print_faults(row)
         if time.time() > self.ends:
             raise TimeLimitReached
+
+    def _print_faults(self, row: dict[str, float]) -> None:
+        """Print what has ended worlds for numbers that are not finite or beyond bounds since the last line."""
+        counts = {name: number for name, number in row.items() if name.startswith(KINDS_OF_FAULTS)}
+        new = {name: number - self.faults.get(name, 0.0) for name, number in counts.items()}
+        self.faults = counts
+        own = [name for name, more in new.items() if more > 0 and not any(x.startswith(f"{name}/") for x in counts)]
+        if own:
+            print("  episodes ended by " + ", ".join(f"{shown(name[1:])}: {new[name]:g}" for name in own), flush=True)
 
     def save_model(self, *_: Any) -> None:
         """Do nothing: checkpoints stay in the folder."""
