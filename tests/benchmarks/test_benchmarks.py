@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import warp_spo as spo
-from benchmarks import breakdown, capabilities, env_digests, kernel_texts
+from benchmarks import breakdown, capabilities, env_digests, guard, kernel_texts
 from benchmarks.__main__ import main
 from benchmarks.table import cases, operation_counts, robots, roofline, runner, shapes
 from benchmarks.table.precisions import PRECISIONS
@@ -230,3 +230,16 @@ def test_bits_of_environments_are_recorded_and_compared(tmp_path, capsys):
     file.write_text(json.dumps({"cartpole": [*bits[:2], *["0"] * (len(bits) - 2)]}))
     assert env_digests.main(["--compare", str(file)]) == 1
     assert capsys.readouterr().out.endswith("cartpole differs within its first 20 steps\n")
+
+
+def test_numbers_that_are_spoilt_in_trainings_are_counted_by_name(tmp_path):
+    """Each ends its world under its name, and no weight is lost; a count that is wrong is said."""
+    file = tmp_path / "guard.json"
+    given = ["cartpole", "--trainings", "1", "--clean", "2", "--iterations", "2", "--worlds", "16", "--json", str(file)]
+    guard.main(given)
+    (row,) = json.loads(file.read_text())["rows"]
+    assert row["spoilt numbers"] > 5 and row["counted wrongly"] == {} and row["tensors not finite"] == 0
+    near = row | {"farthest curve [spreads]": 1.0}  # of two short trainings the spread says nothing
+    assert guard.failures(near) == []
+    wrong = guard.failures(near | {"counted wrongly": {"action": 1}, "tensors not finite": 2})
+    assert len(wrong) == 2 and "{'action': 1}" in wrong[1]

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import re
+import types
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import warp_spo as spo
 from warp_spo import env as environments
 from warp_spo.env import Bounds, Env, Observation, TorchTerm, actions, events, observations, robots
 from warp_spo.env.bounds import size_of, speeds
+from warp_spo.env.training_log import TrainingLog, read_rows
 
 WORLDS, BAD, OTHERS = 4, 2, [0, 1, 3]
 VALUES = {"NaN": math.nan, "inf": math.inf, "1e35": 1e35, "1e12": -1e12}
@@ -251,6 +253,33 @@ def test_bounds_are_widened_and_tightened():
     assert env.step(torch.zeros(WORLDS, 1))[2].tolist() == [0] * WORLDS
     assert env.step(torch.zeros(WORLDS, 1))[2].tolist() == [0, 1, 0, 0]
     assert counts(env) == {"/beyond bounds/observation/actor/in torch": 1}
+
+
+def test_bounds_are_explained(guarded):
+    (line,) = (line for line in guarded[False][0].explain().splitlines() if line.startswith("bounds"))
+    words = "action 1e+05, coordinates 1e+05, speeds 189 to 314, reward 1e+04, observation 1e+05"
+    assert line.split(maxsplit=1)[1] == words
+
+
+def test_a_training_prints_what_ended_worlds(tmp_path, capsys):
+    """What is new since the last line; rows hold sums of kinds, and of names those that have been counted."""
+    names = ("/not finite/reward", "/not finite/reward/up", "/not finite/reward/far", "/beyond bounds/action")
+    counts = [torch.zeros(4), torch.tensor([3.0, 3.0, 0.0, 1.0]), torch.tensor([5.0, 3.0, 2.0, 1.0])]
+    always = dict.fromkeys(("/episode/finished", "/episode/whole", "/episode/seconds"), torch.tensor(1.0))
+    env = types.SimpleNamespace(device="cpu", log=lambda: dict(zip(names, counts.pop(0), strict=True)) | always)
+    log = TrainingLog(env, tmp_path, 1, 0.0, True)
+    log.init_logging_writer()
+    said = []
+    for i in range(3):
+        log.log(i, 3, 0.1, 0.1, {}, action_std=torch.ones(1), learning_rate=1e-3)
+        said.append([line.strip() for line in capsys.readouterr().out.splitlines()[1:]])
+    begins = "episodes ended by "
+    assert said == [
+        [], [f"{begins}not finite/reward/up: 3, beyond bounds/action: 1"], [f"{begins}not finite/reward/far: 2"]
+    ]  # fmt: skip
+    assert [[name in row for name in names] for row in read_rows(tmp_path / "progress.jsonl")] == [
+        [True, False, False, True], [True, True, False, True], [True, True, True, True]
+    ]  # fmt: skip
 
 
 def test_accelerations_are_bounded_on_request():

@@ -77,10 +77,9 @@ class Bounds:
         names = list(rewards)
         of_rewards = _spread("reward", "reward", self.reward, names, np.full(len(names), 1e4))
         limits |= {f"reward/{name}": most for name, most in zip(names, of_rewards, strict=True)}
-        labels = {(group, label): None for group, terms in groups.items() for label in term_labels(terms)}
         terms = [name_of(term) for each in groups.values() for term in each]
         of_terms = _spread("observation", "term", self.observation, terms, np.full(len(terms), 1e5))
-        causes = [f"observation/{group}/{label}" for group, label in labels]
+        causes = [cause for group, terms in groups.items() for cause in term_causes(group, terms)]
         return limits | dict(zip(causes, of_terms, strict=True))
 
 
@@ -89,6 +88,11 @@ def term_labels(terms: Sequence[Observation]) -> list[str]:
     names = [name_of(term) for term in terms]
     plain = [f"term {i}" if name == "unnamed" else name for i, name in enumerate(names)]
     return [name if plain.count(name) == 1 else f"{name} (term {i})" for i, name in enumerate(plain)]
+
+
+def term_causes(group: str, terms: Sequence[Observation]) -> list[str]:
+    """Return what a group's terms are counted as."""
+    return [f"observation/{group}/{label}" for label in term_labels(terms)]
 
 
 def speeds(scene: Scene, dt: float, seconds: float) -> np.ndarray:

@@ -76,7 +76,7 @@ class Env(VecEnv):
 
     Attributes:
         q, qd: state, torch tensors [world, coordinate] and [world, dof].
-        final: the argument ``final_observations``.
+        final: the argument ``final_observations``. bounds: those that end worlds.
         replay: runs a step without its inputs and results; ``replay.captured`` says of how many graphs it is made.
         values: what events have made of the scene's values, torch tensors [world, ...] by name.
         dyn: the :class:`Dynamics`. has_commands: whether it gives commands.

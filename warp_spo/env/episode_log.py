@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from ..errors import shown
@@ -78,6 +79,16 @@ def describe(env: Env) -> str:
     return f"Env({env.num_envs} worlds on {env.warp_device}, {env.num_actions} actions, observations: {groups})"
 
 
+def bounds_in_words(limits: dict[str, Any]) -> list[str]:
+    """Return bounds by cause in words: of all rewards one range, likewise of all observations."""
+    found: dict[str, list[float]] = {}
+    for cause, most in limits.items():
+        kind, *rest = cause.split("/")
+        found.setdefault(rest[0] if kind == "state" else kind, []).extend(np.ravel(most).tolist())
+    ranges = ((kind, min(each), max(each)) for kind, each in found.items())
+    return [f"{kind} {low:.3g}" + (f" to {high:.3g}" if high > low else "") for kind, low, high in ranges]
+
+
 def explain(env: Env, stages: dict[str, list[Launch]], users: dict[Any, tuple[str, int]]) -> str:
     """Return what a step consists of, and what it takes in memory.
 
@@ -91,6 +102,7 @@ def explain(env: Env, stages: dict[str, list[Launch]], users: dict[Any, tuple[st
         f"observations {', '.join(f'{shown(name)} {size}' for name, size in env.num_obs.items())}",
         f"rewards      {', '.join(map(shown, env.reward_names))}",
         f"ends         {', '.join(map(shown, env.termination_names))}, after {env.max_episode_length} steps",
+        f"bounds       {', '.join(bounds_in_words(env._layout.guard.limits))}",
         f"variable     {', '.join(env.values) or 'nothing'}",
         f"memory       {env.bytes_per_world} bytes a world",
     ]

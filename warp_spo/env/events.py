@@ -24,7 +24,8 @@ class Reset:
 
     Args:
         change: function of a ``World``, which assigns to entries of ``w.q`` and ``w.qd``. ``w.before`` is the
-            world at the end of the episode. Values that it keeps with ``w.keep`` stay until the next reset.
+            world at the end of the episode, at rest in default_q if its state was out of bounds. Values that it keeps
+            with ``w.keep`` stay until the next reset.
         first: None, or a function that keeps what worlds remember for good, when the environment is made.
         levels: names of what worlds remember that say how far they have come; a training that resumes goes on there.
     """

@@ -95,7 +95,9 @@ class Learner:
         return {
             "num_steps_per_env": self.steps,
             "save_interval": save_interval,
-            "check_for_nan": False,  # the environment's guard resets and counts such worlds, without waiting
+            # The environment's guard lets no such number out, counts its term and goes on. rsl_rl's check knows NaN
+            # alone, ends the training for one world, and waits for the device three times a step.
+            "check_for_nan": False,
             "obs_groups": {"actor": ["actor"], "critic": ["critic" if "critic" in env.num_obs else "actor"]},
             "actor": model | {"distribution_cfg": distribution},
             "critic": dict(model),

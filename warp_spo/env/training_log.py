@@ -13,10 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from ..errors import shown
+from .compile.guard import BEYOND, NOT_FINITE
 from .training_files import write_bytes
 
 if TYPE_CHECKING:
     from .environment import Env
+
+KINDS_OF_FAULTS = (f"/{NOT_FINITE}/", f"/{BEYOND}/")  # beginnings of names in a log
 
 
 class TrainingLog:
@@ -34,6 +38,7 @@ class TrainingLog:
         self.ends, self.after = began + seconds, after
         self.writes, self.writer = folder is not None and writes, None  # rsl_rl has nothing to write
         self.first = 0  # iteration
+        self.faults: dict[str, float] = {}  # what ended worlds so far, as printed
         self.rows: list[dict[str, float]] = []
         self.git_status_repos: list[str] = []
         self.file: Path | None = None
@@ -91,6 +96,7 @@ class TrainingLog:
             print(f"iteration {it:4d} of {total_it}  {row['seconds']:6.1f} s  reward {reward}  "
                   f"episode {length} s  collecting {1e3 * collect_time:4.0f} ms  "
                   f"learning {1e3 * learn_time:4.0f} ms", flush=True)  # fmt: skip
+            self._print_faults(row)
 
     def _append(self, text: bytes) -> None:
         """Write lines behind those of the file that are whole; what a full disk leaves out is tried again later."""
@@ -119,6 +125,15 @@ class TrainingLog:
             with self.file.open("rb") as held:
                 os.fsync(held.fileno())
 
+    def _print_faults(self, row: dict[str, float]) -> None:
+        """Print what has ended worlds for numbers that are not finite or beyond bounds since the last line."""
+        counts = {name: number for name, number in row.items() if name.startswith(KINDS_OF_FAULTS)}
+        new = {name: number - self.faults.get(name, 0.0) for name, number in counts.items()}
+        self.faults = counts
+        own = [name for name, more in new.items() if more > 0 and not any(x.startswith(f"{name}/") for x in counts)]
+        if own:
+            print("  episodes ended by " + ", ".join(f"{shown(name[1:])}: {new[name]:g}" for name in own), flush=True)
+
     def save_model(self, *_: Any) -> None:
         """Do nothing: checkpoints stay in the folder."""
 
@@ -138,9 +153,13 @@ def peak_memory(device: Any) -> dict[str, float]:
 
 
 def lines_of(rows: list[dict[str, float]]) -> bytes:
-    """Return rows as the lines of a ``progress.jsonl``."""
-    lines = (json.dumps({name: float(f"{value:.6g}") for name, value in row.items()}) + "\n" for row in rows)
-    return "".join(lines).encode()
+    """Return rows as the lines of a ``progress.jsonl``, without the terms that ended no world as not finite."""
+
+    def told(name: str, value: float) -> bool:
+        return value != 0.0 or name.count("/") < 3 or not name.startswith(KINDS_OF_FAULTS)
+
+    kept = ({name: float(f"{x:.6g}") for name, x in row.items() if told(name, x)} for row in rows)
+    return "".join(json.dumps(row) + "\n" for row in kept).encode()
 
 
 def read_rows(file: Path) -> list[dict[str, float]]:

@@ -230,7 +230,7 @@ class FusedKernel:
         """Return the listings of all statements, and their texts with what belongs between them."""
         read = self.read_arrays()
         at_once = lambda item: item.array not in read or (not wide and replaces(item))  # noqa: E731
-        last = [item for item in self.stores if buffers[item.array].memory_order == FOUND]  # depend on all others
+        found = [item for item in self.stores if buffers[item.array].memory_order == FOUND]  # depend on all others
         others = [item for item in self.stores if buffers[item.array].memory_order != FOUND]
         late = [item for item in others if not at_once(item)]  # after all reads of what they overwrite
         early = [item for item in others if at_once(item) and item.array not in wide]
@@ -250,7 +250,7 @@ class FusedKernel:
                     listings.append(emitter.region(inside))
                     parts += [f"BEGIN({start})", render(listings[-1], "float32")]
                     parts.append(f"FLUSH({name}, {entries}, {start}, {part}, {buffers[name].set})")
-        listings.append(emitter.region([*late, *last]))
+        listings.append(emitter.region([*late, *found]))
         return listings, [*parts, render(listings[-1], "float32")]
 
 

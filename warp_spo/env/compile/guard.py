@@ -7,6 +7,7 @@ or in the next one for an observation, whose numbers are zero until then. It cou
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -98,6 +99,23 @@ class Guard:
         if "state/accelerations" in self.limits:
             parts["state/accelerations"] = w.read("qdd", w.scene.dof_count)
         return [self.check(cause, values) for cause, values in parts.items()]
+
+    # -- worlds that end ---------------------------------------------------------------------------------------------
+    def mend(self, w: World, state: Sequence[Check]) -> World:
+        """Return a world at the end of its episode, at rest in default_q where its ``state`` is out of bounds."""
+        ended, fine = copy.copy(w), Condition(1.0)
+        for check in state:
+            fine = fine & check.fine
+        ended.__dict__["q"] = vector(where(fine, x, float(y)) for x, y in zip(w.q, w.default_q, strict=True))
+        ended.__dict__["qd"] = vector(where(fine, x, 0.0) for x in w.qd)
+        return ended
+
+    def hold(self, w: World, names: Sequence[str], bad: Condition) -> None:
+        """Leave memory that resets leave alone as it was in worlds that are ``bad``."""
+        for name in names:
+            if w._layout.memory[name][2] is None:
+                pairs = zip(w.stored_memory(name), w.kept[name], strict=True)
+                w.keep(name, [where(bad, old, new) for old, new in pairs])
 
     # -- what other stages find --------------------------------------------------------------------------------------
     def leave(self, w: World, name: str, checks: Sequence[Check], goes: Condition | None = None) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 from ...errors import shown
 from ...trace.functions import AbstractScalar, Condition, where
 from ...trace.scalars import branch, floor, ordered
-from ..bounds import term_labels
+from ..bounds import term_causes
 from ..commands import COMMAND, HELD
 from ..events import EncoderBias, Interval, Reset, Start, Values
 from ..observations import Observation, name_of
@@ -96,7 +96,12 @@ class Tracing:
     def run(self, steps: int, final: bool) -> None:
         """Trace all stages; ``steps`` are those of an episode; ``final`` asks for the stage of that name."""
         self.final = final
-        self.guard.apart = [cause for terms in self._causes().values() for cause, term in terms if term.rows]
+        self.guard.apart = [
+            cause
+            for group, terms in self.groups.items()
+            for cause, term in zip(term_causes(group, terms), terms, strict=True)
+            if term.rows
+        ]
         self._act()
         self._judge(steps)
         self._observe()
@@ -105,7 +110,7 @@ class Tracing:
         for name, (_, _, update) in [*self.layout.sensors.items()]:
             if name not in self.judge.kept:
                 update(self.judge)
-                self._hold(self.judge, [name])
+                self.guard.hold(self.judge, [name], self.bad)
         self._first()
         self._close()
         self._reset()
@@ -154,8 +159,8 @@ class Tracing:
             w.keep(f"sum reward {name}", w.memory(f"sum reward {name}", 1) + where(bad, 0.0, value))
         ends = {name: condition(f"termination {name!r} returned", term(w)) for name, term in self.terminations.items()}
         ends |= self.guard.ends(fault)
-        self.bad, self.ended = bad, self._without(w, state)
-        self._hold(w, list(w.kept))
+        self.bad, self.ended = bad, self.guard.mend(w, state)
+        self.guard.hold(w, list(w.kept), bad)
         terminated = bad
         for name in self.terminations:
             terminated = terminated | ends[name]
@@ -175,24 +180,6 @@ class Tracing:
         for (name, _), value in zip(finished, news, strict=True):
             w.keep(name, [value])
         self.after = self._start(w, done, intervals=True)
-
-    def _without(self, w: World, state: list[Check]) -> World:
-        """Return the world at the end of its episode, at rest in default_q where its state is out of bounds."""
-        ended = World(self.layout, w._stage)
-        ended.__dict__.update(w.__dict__)
-        fine = Condition(1.0)
-        for check in state:
-            fine = fine & check.fine
-        ended.__dict__["q"] = vector(where(fine, x, float(y)) for x, y in zip(w.q, self.layout.default_q, strict=True))
-        ended.__dict__["qd"] = vector(where(fine, x, 0.0) for x in w.qd)
-        return ended
-
-    def _hold(self, w: World, names: list[str]) -> None:
-        """Leave memory that resets leave alone as it was in worlds that the guard ends."""
-        for name in names:
-            if self.layout.memory[name][2] is None:
-                pairs = zip(w.stored_memory(name), w.kept[name], strict=True)
-                w.keep(name, [where(self.bad, old, new) for old, new in pairs])
 
     def _start(self, w: World, done: Condition, intervals: bool) -> World:
         """Start worlds anew where ``done`` holds; let events happen and draw commands in the others.
@@ -364,10 +351,10 @@ class Tracing:
         Returns what the guard found in those of ``w``.
         """
         of_rows: dict[int, World] = {}
-        causes, checks = self._causes(), []  # type: ignore[var-annotated]
+        checks: list[Check] = []
         for group, terms in self.groups.items():
             name, at, starts = self.layout.output(kind + group), 0, [0]
-            for i, ((cause, _), term) in enumerate(zip(causes[group], terms, strict=True)):
+            for i, (cause, term) in enumerate(zip(term_causes(group, terms), terms, strict=True)):
                 rows, what = term.rows, f"observations[{group!r}][{i}] ({name_of(term)})"
                 if rows:
                     self.apart.add(kind + group)
@@ -376,7 +363,7 @@ class Tracing:
                         self.stages[f"{w._stage.name}, {rows} rows"] = stage
                         of_rows[rows] = begin(stage)
                     one, stage = of_rows[rows], of_rows[rows]._stage
-                    goes = self._goes(one) if kind == "" else None
+                    goes = steps_on(one) if kind == "" else None
                     for number in range(stage.at_once):
                         found: list[Check] = []
                         (value,) = self.guard.admit(cause, [term.trace_row(one, number, what)], found)
@@ -391,28 +378,14 @@ class Tracing:
             if not at:
                 raise ValueError(f"Env: the terms of observations[{group!r}] returned no numbers; expected one or more")
             self.group_sizes[group], self.term_sizes[group] = at, np.diff(starts).tolist()
-        return self.guard.leave(w, f"{kind}observations", checks, self._goes(w) if kind == "" else None)
-
-    def _causes(self) -> dict[str, list[tuple[str, Observation]]]:
-        """Return the terms of each group with what the guard counts them as."""
-        return {
-            group: [
-                (f"observation/{group}/{label}", term) for label, term in zip(term_labels(terms), terms, strict=True)
-            ]
-            for group, terms in self.groups.items()
-        }
-
-    @staticmethod
-    def _goes(w: World) -> Condition:
-        """Return whether a look at the world is a step of its own; one after a reset of others is not."""
-        return (w.read("advance", 1)[0] > 0.5) | w.fresh
+        return self.guard.leave(w, f"{kind}observations", checks, steps_on(w) if kind == "" else None)
 
     # -- memory ----------------------------------------------------------------------------------------------------
     def _close(self) -> None:
         """Store what each stage keeps; what a reset clears is cleared by the stage that resets."""
         for name, values in self.act.kept.items():
             self._keep(self.act, name, values)
-        goes = self._goes(self.observed)
+        goes = steps_on(self.observed)
         for name, values in self.observed.kept.items():
             old = self.observed.stored_memory(name)
             due = goes & (self.found < 0.5) if self.layout.memory[name][2] is None else goes
@@ -472,6 +445,11 @@ class Tracing:
         stage.store("episode_length", 0, as_value(where(chosen, 0.0, w.read("episode_length", 1)[0])))
         self._clear(w, chosen)
         self.guard.clear(w, chosen)
+
+
+def steps_on(w: World) -> Condition:
+    """Return whether a look at a world is a step of its own; one after a reset of others is not."""
+    return (w.read("advance", 1)[0] > 0.5) | w.fresh
 
 
 def choose(due: Condition, news: Any, olds: Any, name: str) -> Vector:
