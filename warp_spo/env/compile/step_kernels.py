@@ -297,7 +297,7 @@ class Tracing:
             w._stage.store(array, i, as_value(value))
             if later is not None:
                 name = array.removeprefix("value_")
-                later.present.setdefault(name, later.value(name).copy()).reshape(-1)[i] = value
+                later.present.setdefault(name, later.value(name).astype(object)).reshape(-1)[i] = value
 
     def _first(self) -> None:
         """Draw what is drawn once: values of the scene, and memory."""
