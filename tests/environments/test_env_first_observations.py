@@ -339,7 +339,7 @@ def walked_env():
     )  # fmt: skip
 
 
-def differing(env, observed, worlds):
+def find_differing(env, observed, worlds):
     """Return the names of what is not as it should be in the first observation of these worlds."""
     found = set()
     for world in worlds:
@@ -358,21 +358,21 @@ def acts(step):
 def walk(env):
     """Return the names of what differs in the first observation after any kind of start, or in clocks after it."""
     every = [0, 1, 2]
-    found = differing(env, env.get_observations(), every)
+    found = find_differing(env, env.get_observations(), every)
     for step in range(4):
         env.step(acts(step))
-    found |= differing(env, env.reset(torch.tensor([True, False, True]))[0], [0, 2])
+    found |= find_differing(env, env.reset(torch.tensor([True, False, True]))[0], [0, 2])
     env.step(acts(4))
     env.q[1, 0] = 60.0
     observed, _, done, extras = env.step(acts(5))
     assert done.tolist() == [0, 1, 0] and not extras["time_outs"].any()
-    found |= differing(env, observed, [1])
-    found |= differing(env, env.reset()[0], every)
-    found |= differing(env, env.reset(seed=7)[0], every) | clocks_that_differ(env)
+    found |= find_differing(env, observed, [1])
+    found |= find_differing(env, env.reset()[0], every)
+    found |= find_differing(env, env.reset(seed=7)[0], every) | clocks_that_differ(env)
     for step in range(STEPS, 70):
         observed, _, done, extras = env.step(acts(step))
     assert done.all() and extras["time_outs"].all()
-    return found | differing(env, observed, every)
+    return found | find_differing(env, observed, every)
 
 
 def clocks_that_differ(env):

@@ -11,6 +11,7 @@ import warp_spo.env as envs
 from support.env_scenes import FEET, cart_env, cart_scene, walker_env, walker_q, walker_scene
 from warp_spo.env import TorchTerm, actions, commands, evaluation, events, observations, rewards
 from warp_spo.env.tasks import velocity
+from warp_spo.reference import Dense
 
 FLOAT32 = 1e-6  # a few roundings of numbers of size one
 STILL = dict(terminations={}, rewards={}, events=[])
@@ -337,6 +338,22 @@ def test_gears_and_grounds_are_the_worlds():
     height = walker_q()[2] - env.values["ground_origin"][:, 2:].numpy()
     assert np.ptp(height) > 0.05
     np.testing.assert_allclose(env.get_observations()["a"].numpy(), height - [0.0, 0.0, 0.05], atol=1e-5)
+
+
+def test_worlds_of_a_scene_may_differ():
+    """Values, and first gaps where legs are of other lengths, of a scene whose worlds have their own."""
+    scene = walker_scene()
+    poses = np.repeat(scene.values["joint_X_p"], 3, axis=0)
+    poses[:, 2::2, 2] -= np.array([[0.0], [0.05], [0.1]])
+    scene = scene.with_values(joint_X_p=poses)
+    seen = {"a": [observations.feet_height(FEET), lambda w: w.value("joint_X_p")[2, 2]]}
+    env = walker_env(3, scene=scene, **(STILL | dict(observations=seen)))
+    observed = env.get_observations()["a"].double().numpy()
+    np.testing.assert_allclose(observed[:, 4], poses[:, 2, 2], rtol=1e-6)
+    for world, q in enumerate(env.q.double().numpy()):
+        dense = Dense(scene, q, world=world)
+        feet = [dense.body_matrix[2 * leg + 2] @ [0.0, 0.0, -0.2, 1.0] for leg in range(4)]
+        np.testing.assert_allclose(observed[world, :4], [foot[2] - 0.02 for foot in feet], atol=FLOAT32)
 
 
 def test_a_loaded_log_leaves_out_what_the_saved_one_does():
