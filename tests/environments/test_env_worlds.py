@@ -109,6 +109,35 @@ def test_what_start_and_reset_keep_stays():
     assert env.levels()["level"].equal(torch.full((3, 1), 3.0))
 
 
+def test_the_time_in_events_is_that_of_their_world():
+    """Zero where an episode starts, the time after the step where one goes on."""
+
+    def start(w):
+        w.keep("start", [w.time, 1.0 if w.before is None else w.before.time])
+
+    def change(w):
+        w.keep("change", [w.time])
+
+    seen = {"a": [lambda w: [*w.memory("start", 2), w.memory("change", 1)[0]]]}
+    env = cart_env(
+        2, observations=seen, terminations={}, events=[events.Reset(start), events.Interval(change, (0.06, 0.06))]
+    )
+    found = torch.stack([env.step(torch.zeros(2, 1))[0]["a"][0] for _ in range(20)])
+    assert torch.allclose(found[[2, 5], 2], torch.tensor([0.06, 0.12])) and (found[:, 0] == 0.0).all()
+    assert (found[:19, 1] == 1.0).all() and found[19, 1] == pytest.approx(0.4)
+
+
+def test_exports_are_of_the_robot_that_is_not_drawn():
+    """Gears that a world draws are not those of an exported policy's robot, and are there again afterwards."""
+    export = pytest.importorskip("warp_spo.env.export")
+    env = walker_env(
+        2, **(STILL | dict(events=[events.randomise("actuator_gear", (0.5, 0.8)), events.encoder_bias(0.1)]))
+    )
+    gears, bias = env.values["actuator_gear"].clone(), env.memory("encoder bias").clone()
+    np.testing.assert_allclose(export.controls_of(env)[1], walker_q()[7:], rtol=1e-5)
+    assert env.values["actuator_gear"].equal(gears) and env.memory("encoder bias").equal(bias)
+
+
 def test_memories_of_other_sizes_and_of_values_are_refused():
     """Numbers beyond those of a name would be those of another one."""
     with pytest.raises(ValueError, match=r"World.memory: 'x' has 1 numbers.*asks for 2"):
