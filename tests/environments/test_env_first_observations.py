@@ -24,7 +24,6 @@ TABLE = np.arange(8.0).reshape(4, 2) ** 2
 FLOAT32 = 3e-5  # of numbers of a size: gaps of bodies 1 m away, drives of 50 N m/rad at rounded angles
 STEPS = 55  # one more than a period of one second and a few
 LOW, SHARE, WIDE = -1.2, 0.5, 0.4  # lower limits [rad], share of joint_limits, deviation of posture
-WORDS = dict(deviation=0.4, height=0.03)
 
 
 def scene():
@@ -122,7 +121,7 @@ class Truth:
         return self.q[7:] - self.default[7:]
 
 
-def marked(term):
+def as_number(term):
     """Return the term of a condition as 1 or 0."""
     return lambda w: spo.where(term(w), 1.0, 0.0)
 
@@ -264,9 +263,9 @@ READY = {
     rewards.landing_force: (rewards.landing_force(FEET), lambda t: 0.0),
     rewards.touching: (rewards.touching(FEET), lambda t: 0.0),
     rewards.joint_limits: (rewards.joint_limits(SHARE), beyond_limits),
-    terminations.tilted: (marked(terminations.tilted(0.4)), lambda t: t.gravity[2] > -np.cos(0.4)),
-    terminations.below: (marked(terminations.below(0.4)), lambda t: t.q[2] - t.ground < 0.4),
-    terminations.touching: (marked(terminations.touching("trunk")), lambda t: 0.0),
+    terminations.tilted: (as_number(terminations.tilted(0.4)), lambda t: t.gravity[2] > -np.cos(0.4)),
+    terminations.below: (as_number(terminations.below(0.4)), lambda t: t.q[2] - t.ground < 0.4),
+    terminations.touching: (as_number(terminations.touching("trunk")), lambda t: 0.0),
     velocity.base_height: lambda t: t.q[2] - t.ground,
     velocity.feet_state: (velocity.feet_state(FEET), lambda t: [*t.gap[:2], *np.zeros(6)]),
     velocity.upright: lambda t: np.exp(-5.0 * (t.gravity[:2] ** 2).sum()),
@@ -291,7 +290,7 @@ def count_steps(w):
     w.keep("count", w.memory("count", 1) + 1.0)
 
 
-def clocks(w):
+def read_clocks(w):
     """Return numbers that are counted over steps: of two terms of two heights each, and of events."""
     steps = [rewards.stepping(FEET, each, longest=0.1)(w) for each in (0.01, 0.06)]
     swings = [velocity.swing_height(FEET, each, least_command=-1.0)(w) for each in (0.05, 0.07)]
@@ -302,7 +301,7 @@ def push(w):
     w.keep("pushes", w.memory("pushes", 1, reset=None) + 1.0)
 
 
-def walked_terms():
+def list_walked_terms():
     """Return term and truth by name."""
     ready = {}
     for made, found in READY.items():
@@ -311,14 +310,14 @@ def walked_terms():
     return ATTRIBUTES | ready
 
 
-def walked_env():
+def make_walked_env():
     """Return the environment that observes all of them, each in a group of its own, with two rewards' memories."""
-    groups = {name: [term] for name, (term, _) in walked_terms().items()}
+    groups = {name: [term] for name, (term, _) in list_walked_terms().items()}
     every = (1.0, 1.0)
     return Env(
         scene(), 3, "cpu", seed=2, default_q=[0, 0, 0.24, 0, 0, 0, 1, 0.3, -0.2], episode_length_s=1.4,
         actions=[actions.Control(scale=0.3, offset="default"), actions.Position(scale=0.3)],
-        observations=groups | {"clocks": [clocks]},
+        observations=groups | {"clocks": [read_clocks]},
         rewards={"stepping": (1.0, rewards.stepping(FEET, 0.06)), "swing": (1.0, velocity.swing_height(FEET, 0.07))},
         terminations={"far": lambda w: w.q[0] > 50.0},
         commands=commands.Velocity(heading=(-3.0, 3.0), standing=0.3),
@@ -344,14 +343,14 @@ def find_differing(env, observed, worlds):
     found = set()
     for world in worlds:
         truth = Truth(env, world)
-        for name, (_, expected) in walked_terms().items():
+        for name, (_, expected) in list_walked_terms().items():
             wanted, came = np.ravel(expected(truth)).astype(float), observed[name][world].double().numpy()
             if came.shape != wanted.shape or not (abs(came - wanted) <= FLOAT32 * (1.0 + abs(wanted).max())).all():
                 found.add(name)
     return found
 
 
-def acts(step):
+def draw_actions(step):
     return torch.sin(torch.arange(6.0).view(3, 2) + 0.9 * step)
 
 
@@ -360,28 +359,28 @@ def walk(env):
     every = [0, 1, 2]
     found = find_differing(env, env.get_observations(), every)
     for step in range(4):
-        env.step(acts(step))
+        env.step(draw_actions(step))
     found |= find_differing(env, env.reset(torch.tensor([True, False, True]))[0], [0, 2])
-    env.step(acts(4))
+    env.step(draw_actions(4))
     env.q[1, 0] = 60.0
-    observed, _, done, extras = env.step(acts(5))
+    observed, _, done, extras = env.step(draw_actions(5))
     assert done.tolist() == [0, 1, 0] and not extras["time_outs"].any()
     found |= find_differing(env, observed, [1])
     found |= find_differing(env, env.reset()[0], every)
-    found |= find_differing(env, env.reset(seed=7)[0], every) | clocks_that_differ(env)
+    found |= find_differing(env, env.reset(seed=7)[0], every) | find_differing_clocks(env)
     for step in range(STEPS, 70):
-        observed, _, done, extras = env.step(acts(step))
+        observed, _, done, extras = env.step(draw_actions(step))
     assert done.all() and extras["time_outs"].all()
     return found | find_differing(env, observed, every)
 
 
-def clocks_that_differ(env):
+def find_differing_clocks(env):
     """Return the names of clocks that differ from NumPy's over ``STEPS`` steps after a start."""
     found, low, high = set(), np.zeros((3, 2)), np.zeros((2, 3, 2))
     top, before = np.zeros((3, 2)), np.zeros((3, 2), bool)
     friction, changes = env.values["contact_friction"][:, 2].clone(), []
     for step in range(STEPS):
-        came = env.step(acts(step))[0]["clocks"].double().numpy()
+        came = env.step(draw_actions(step))[0]["clocks"].double().numpy()
         touches = env._tensors["contact_f"][:, :2].norm(dim=2).numpy() > 1.0
         gap = env._tensors["contact_gap"][:, :2].double().numpy()
         low, top = np.where(touches, 0, low + 1), np.maximum(gap, top)
@@ -403,7 +402,7 @@ def clocks_that_differ(env):
 def test_everything_that_terms_may_read_is_walked():
     """A new attribute of World, or a new ready term, has a truth here, or a word on why it needs none."""
     public = {name for name in dir(World) if not name.startswith("_")}
-    made = {*vars(World(walked_layout(), None))} - {"_layout", "_stage"}
+    made = {*vars(World(make_layout(), None))} - {"_layout", "_stage"}
     assert public | made == ATTRIBUTES.keys() | STATED.keys() and not ATTRIBUTES.keys() & STATED.keys()
     for module, others in OTHERS.items():
         own = [
@@ -414,7 +413,7 @@ def test_everything_that_terms_may_read_is_walked():
         assert functions == walked | {*others}, module.__name__
 
 
-def walked_layout():
+def make_layout():
     from warp_spo.env.compile.memory_layout import MemoryLayout
 
     return MemoryLayout(scene(), np.zeros(9), 0.02, None, ())
@@ -422,16 +421,16 @@ def walked_layout():
 
 @pytest.mark.slow
 def test_first_observations_and_clocks():
-    assert walk(walked_env()) == set()
+    assert walk(make_walked_env()) == set()
 
 
-def stale(monkeypatch):
+def keep_reports_stale(monkeypatch):
     """Gaps, slips and forces stay those of the last step."""
     monkeypatch.setattr(Tracing, "_store_reports", lambda *parts: None)
     return {"contact_gap", "contact_slip", "joint_force", "feet", "observations.feet_height", "rewards.power"}
 
 
-def shared(monkeypatch):
+def share_a_memory(monkeypatch):
     """Terms of different heights share one memory."""
     sensor = World.sensor
     name = lambda text: "stepping" if text.startswith("stepping") else text  # noqa: E731
@@ -450,7 +449,7 @@ def update_as(w, text, update):
         w.keep("stepping", w.kept.pop(text))
 
 
-def float_countdown(monkeypatch):
+def count_down_in_float(monkeypatch):
     """A wait is a time from which the step is taken again and again, in float32."""
 
     def wait(tracing, w, seconds):
@@ -464,15 +463,15 @@ def float_countdown(monkeypatch):
     return {"periods"}
 
 
-def scenes_value(monkeypatch):
+def read_the_scenes_values(monkeypatch):
     """Terms read the scene's values in place of the world's."""
     monkeypatch.setattr(World, "value", lambda w, name: w.scene.values[name][0])
     return {"projected_gravity", "base_velocity", "rewards.joint_limits", "joint_force", "base_height", "value"}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plant", [stale, shared, float_countdown, scenes_value])
+@pytest.mark.parametrize("plant", [keep_reports_stale, share_a_memory, count_down_in_float, read_the_scenes_values])
 def test_planted_faults_are_found(monkeypatch, plant):
     spoilt = plant(monkeypatch)
-    found = walk(walked_env())
+    found = walk(make_walked_env())
     assert spoilt <= found, f"not found: {spoilt - found}"

@@ -17,7 +17,7 @@ FLOAT32 = 1e-6  # a few roundings of numbers of size one
 STILL = dict(terminations={}, rewards={}, events=[])
 
 
-def first_gaps(env, observed):
+def compare_gaps(env, observed):
     """Return what is observed of gaps, and those of the dense reference at the environment's state."""
     wanted = []
     for q in env.q.double().numpy():
@@ -39,7 +39,7 @@ def test_first_gaps_and_slips_are_those_of_the_new_state():
     )  # fmt: skip
 
     def check(observed, worlds):
-        found, wanted = first_gaps(env, observed)
+        found, wanted = compare_gaps(env, observed)
         np.testing.assert_allclose(found[worlds], wanted[worlds], atol=FLOAT32)
         speeds = np.linalg.norm(env.qd[worlds, :2].numpy(), axis=1)  # of the belly where nothing turns
         np.testing.assert_allclose(observed["a"][worlds, 8].numpy(), speeds, rtol=1e-4, atol=1e-4)
@@ -159,7 +159,7 @@ def test_memories_of_other_sizes_and_of_values_are_refused():
         cart_env(2, events=[events.Values(("body_mass",), change)])
 
 
-def feet_now(env):
+def read_feet(env):
     """Return which feet touch, and their gaps [world, foot]."""
     return env._tensors["contact_f"][:, :4].norm(dim=2).numpy() > 1.0, env._tensors["contact_gap"][:, :4].numpy().copy()
 
@@ -175,7 +175,7 @@ def test_terms_of_one_memory_leave_it_to_each_other():
     low, high, top, before, landed = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4), bool), 0
     for step in range(30):
         observed, reward, *_ = env.step(1.5 * torch.sin(torch.arange(32.0).view(4, 8) + 0.35 * step))
-        touches, gap = feet_now(env)
+        touches, gap = read_feet(env)
         low, high, top = np.where(touches, 0, low + 1), np.where(gap > 0.02, 0, high + 1), np.maximum(gap, top)
         wanted = [((low < each / 0.02 - 0.5) & (high < each / 0.02 - 0.5)).mean(1) for each in longest]
         wanted += [np.where(touches & ~before, (top / each - 1.0) ** 2, 0.0).sum(1) for each in heights]
@@ -424,15 +424,17 @@ def test_terms_in_torch_see_the_new_state():
 
 
 def test_the_first_gap_of_two_bodies_is_that_of_the_new_state():
-    env = pair_env()
+    env = make_pair_env()
     q = env.q.numpy()
-    np.testing.assert_allclose(env.get_observations()["a"][:, 0].numpy(), gap_of_spheres(q), atol=FLOAT32)
+    np.testing.assert_allclose(env.get_observations()["a"][:, 0].numpy(), find_gap_of_spheres(q), atol=FLOAT32)
     env.step(torch.zeros(3, 1))
     observed, _ = env.reset(torch.tensor([True, False, True]))
-    np.testing.assert_allclose(observed["a"][[0, 2], 0].numpy(), gap_of_spheres(env.q.numpy())[[0, 2]], atol=FLOAT32)
+    np.testing.assert_allclose(
+        observed["a"][[0, 2], 0].numpy(), find_gap_of_spheres(env.q.numpy())[[0, 2]], atol=FLOAT32
+    )
 
 
-def pair_env():
+def make_pair_env():
     """Two balls of 0.1 m on one rail."""
     ball = lambda name: spo.Body(1.0, inertia=0.01 * np.eye(3), label=name)  # noqa: E731
     rail = lambda body: spo.Hinge("prismatic", -1, body, axis=(1, 0, 0), label=f"rail{body}")  # noqa: E731
@@ -446,7 +448,7 @@ def pair_env():
     )  # fmt: skip
 
 
-def gap_of_spheres(q):
+def find_gap_of_spheres(q):
     return q[:, 1] - q[:, 0] - 0.2
 
 
