@@ -11,12 +11,13 @@ import warp_spo.env as envs
 from support.env_scenes import FEET, cart_env, cart_scene, walker_env, walker_q, walker_scene
 from warp_spo.env import TorchTerm, actions, commands, evaluation, events, observations, rewards
 from warp_spo.env.tasks import velocity
+from warp_spo.reference import Dense
 
 FLOAT32 = 1e-6  # a few roundings of numbers of size one
 STILL = dict(terminations={}, rewards={}, events=[])
 
 
-def first_gaps(env, observed):
+def compare_gaps(env, observed):
     """Return what is observed of gaps, and those of the dense reference at the environment's state."""
     wanted = []
     for q in env.q.double().numpy():
@@ -38,7 +39,7 @@ def test_first_gaps_and_slips_are_those_of_the_new_state():
     )  # fmt: skip
 
     def check(observed, worlds):
-        found, wanted = first_gaps(env, observed)
+        found, wanted = compare_gaps(env, observed)
         np.testing.assert_allclose(found[worlds], wanted[worlds], atol=FLOAT32)
         speeds = np.linalg.norm(env.qd[worlds, :2].numpy(), axis=1)  # of the belly where nothing turns
         np.testing.assert_allclose(observed["a"][worlds, 8].numpy(), speeds, rtol=1e-4, atol=1e-4)
@@ -108,6 +109,35 @@ def test_what_start_and_reset_keep_stays():
     assert env.levels()["level"].equal(torch.full((3, 1), 3.0))
 
 
+def test_the_time_in_events_is_that_of_their_world():
+    """Zero where an episode starts, the time after the step where one goes on."""
+
+    def start(w):
+        w.keep("start", [w.time, 1.0 if w.before is None else w.before.time])
+
+    def change(w):
+        w.keep("change", [w.time])
+
+    seen = {"a": [lambda w: [*w.memory("start", 2), w.memory("change", 1)[0]]]}
+    env = cart_env(
+        2, observations=seen, terminations={}, events=[events.Reset(start), events.Interval(change, (0.06, 0.06))]
+    )
+    found = torch.stack([env.step(torch.zeros(2, 1))[0]["a"][0] for _ in range(20)])
+    assert torch.allclose(found[[2, 5], 2], torch.tensor([0.06, 0.12])) and (found[:, 0] == 0.0).all()
+    assert (found[:19, 1] == 1.0).all() and found[19, 1] == pytest.approx(0.4)
+
+
+def test_exports_are_of_the_robot_that_is_not_drawn():
+    """Gears that a world draws are not those of an exported policy's robot, and are there again afterwards."""
+    export = pytest.importorskip("warp_spo.env.export")
+    env = walker_env(
+        2, **(STILL | dict(events=[events.randomise("actuator_gear", (0.5, 0.8)), events.encoder_bias(0.1)]))
+    )
+    gears, bias = env.values["actuator_gear"].clone(), env.memory("encoder bias").clone()
+    np.testing.assert_allclose(export.controls_of(env)[1], walker_q()[7:], rtol=1e-5)
+    assert env.values["actuator_gear"].equal(gears) and env.memory("encoder bias").equal(bias)
+
+
 def test_memories_of_other_sizes_and_of_values_are_refused():
     """Numbers beyond those of a name would be those of another one."""
     with pytest.raises(ValueError, match=r"World.keep\('x'\) was given a list of 2; expected one number"):
@@ -129,7 +159,7 @@ def test_memories_of_other_sizes_and_of_values_are_refused():
         cart_env(2, events=[events.Values(("body_mass",), change)])
 
 
-def feet_now(env):
+def read_feet(env):
     """Return which feet touch, and their gaps [world, foot]."""
     return env._tensors["contact_f"][:, :4].norm(dim=2).numpy() > 1.0, env._tensors["contact_gap"][:, :4].numpy().copy()
 
@@ -145,7 +175,7 @@ def test_terms_of_one_memory_leave_it_to_each_other():
     low, high, top, before, landed = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4), bool), 0
     for step in range(30):
         observed, reward, *_ = env.step(1.5 * torch.sin(torch.arange(32.0).view(4, 8) + 0.35 * step))
-        touches, gap = feet_now(env)
+        touches, gap = read_feet(env)
         low, high, top = np.where(touches, 0, low + 1), np.where(gap > 0.02, 0, high + 1), np.maximum(gap, top)
         wanted = [((low < each / 0.02 - 0.5) & (high < each / 0.02 - 0.5)).mean(1) for each in longest]
         wanted += [np.where(touches & ~before, (top / each - 1.0) ** 2, 0.0).sum(1) for each in heights]
@@ -339,6 +369,22 @@ def test_gears_and_grounds_are_the_worlds():
     np.testing.assert_allclose(env.get_observations()["a"].numpy(), height - [0.0, 0.0, 0.05], atol=1e-5)
 
 
+def test_worlds_of_a_scene_may_differ():
+    """Values, and first gaps where legs are of other lengths, of a scene whose worlds have their own."""
+    scene = walker_scene()
+    poses = np.repeat(scene.values["joint_X_p"], 3, axis=0)
+    poses[:, 2::2, 2] -= np.array([[0.0], [0.05], [0.1]])
+    scene = scene.with_values(joint_X_p=poses)
+    seen = {"a": [observations.feet_height(FEET), lambda w: w.value("joint_X_p")[2, 2]]}
+    env = walker_env(3, scene=scene, **(STILL | dict(observations=seen)))
+    observed = env.get_observations()["a"].double().numpy()
+    np.testing.assert_allclose(observed[:, 4], poses[:, 2, 2], rtol=1e-6)
+    for world, q in enumerate(env.q.double().numpy()):
+        dense = Dense(scene, q, world=world)
+        feet = [dense.body_matrix[2 * leg + 2] @ [0.0, 0.0, -0.2, 1.0] for leg in range(4)]
+        np.testing.assert_allclose(observed[world, :4], [foot[2] - 0.02 for foot in feet], atol=FLOAT32)
+
+
 def test_a_loaded_log_leaves_out_what_the_saved_one_does():
     env, other = (cart_env(8, terminations={}) for _ in range(2))
     env.episode_length_buf = torch.tensor([0, *[5] * 7])
@@ -378,15 +424,17 @@ def test_terms_in_torch_see_the_new_state():
 
 
 def test_the_first_gap_of_two_bodies_is_that_of_the_new_state():
-    env = pair_env()
+    env = make_pair_env()
     q = env.q.numpy()
-    np.testing.assert_allclose(env.get_observations()["a"][:, 0].numpy(), gap_of_spheres(q), atol=FLOAT32)
+    np.testing.assert_allclose(env.get_observations()["a"][:, 0].numpy(), find_gap_of_spheres(q), atol=FLOAT32)
     env.step(torch.zeros(3, 1))
     observed, _ = env.reset(torch.tensor([True, False, True]))
-    np.testing.assert_allclose(observed["a"][[0, 2], 0].numpy(), gap_of_spheres(env.q.numpy())[[0, 2]], atol=FLOAT32)
+    np.testing.assert_allclose(
+        observed["a"][[0, 2], 0].numpy(), find_gap_of_spheres(env.q.numpy())[[0, 2]], atol=FLOAT32
+    )
 
 
-def pair_env():
+def make_pair_env():
     """Two balls of 0.1 m on one rail."""
     ball = lambda name: spo.Body(1.0, inertia=0.01 * np.eye(3), label=name)  # noqa: E731
     rail = lambda body: spo.Hinge("prismatic", -1, body, axis=(1, 0, 0), label=f"rail{body}")  # noqa: E731
@@ -400,7 +448,7 @@ def pair_env():
     )  # fmt: skip
 
 
-def gap_of_spheres(q):
+def find_gap_of_spheres(q):
     return q[:, 1] - q[:, 0] - 0.2
 
 

@@ -321,11 +321,11 @@ def test_ants_are_paid_for_a_trot_of_all_legs():
         gap = env.dyn.frame_poses(env.q, feet)[:, :, 2] - 0.08
         fl, hl, hr, fr = touches.T
         rules = (fl == hr).float() + (hl == fr).float() + (fl != fr).float() + (hl != hr).float()
-        since = env.memory(f"stepping {ant.FEET!r} 0.05") * env.step_dt
+        since = env.memory(f"stepping {ant.FEET!r} 0.05").clone()  # steps
         clear = torch.cat([torch.ones_like(touches), (gap - 0.05).abs() > 0.04], dim=1) & going[:, None]
-        wanted = torch.where(torch.cat([touches, gap > 0.05], dim=1), torch.zeros(()), times + env.step_dt)
+        wanted = torch.where(torch.cat([touches, gap > 0.05], dim=1), torch.zeros(()), times + 1.0)
         assert torch.allclose(since[clear], wanted[clear], atol=1e-4), step
-        steps = ((since[:, :4] < 0.4) & (since[:, 4:] < 0.4)).float().sum(dim=1)
+        steps = ((since[:, :4] < 20.0) & (since[:, 4:] < 20.0)).float().sum(dim=1)  # 0.4 s of 20 ms
         now = torch.stack([env.memory(name)[:, 0].clone() for name in names])
         wanted = 0.25 * env.step_dt * torch.stack([ant.TROT * rules, ant.STEPPING * steps])
         assert torch.allclose((now - before)[:, going], wanted[:, going], atol=1e-5), step

@@ -24,7 +24,7 @@ and :mod:`.terminations`.
 
     actions ──ACT──> ctrl, target_q or tau                       scale, offset, clip; action history
             dyn.step ──> q, qd, contact_f, contact_gap, contact_slip
-            JUDGE: q, qd, contacts, memory ──> reward, done, time_out; and in worlds that are done new q, qd;
+            JUDGE: q, qd, contacts, memory ──> reward, done, time_out; and in worlds that are done new q, qd, gaps;
                    commands, pushes, timers, sums of episodes, air times
             dyn.reset_actuator_state(done)
             OBSERVE: q, qd, command, memory ──> a row of each group, with noise

@@ -47,7 +47,7 @@ class Interval:
 
     Args:
         change: function of a ``World``.
-        seconds: range of the time from one change to the next.
+        seconds: range of the time from one change to the next, rounded up to whole steps.
     """
 
     change: Callable[[World], None]
@@ -67,7 +67,8 @@ class Values:
         change: function of a ``World`` that assigns to entries of ``w.values[name]``, which are the scene's own
             numbers before; arrays [...] in Newton's layout.
         when: "start": once, when the environment is made, and in ``env.reset(seed=)``. "reset": at each start of an
-            episode. Or the range of the time from one change to the next [s].
+            episode. Or the range of the time from one change to the next, and from the start to the first one [s], in
+            whole steps, rounded up.
     """
 
     names: tuple[str, ...]

@@ -76,17 +76,20 @@ def controls_of(env: Env) -> tuple[np.ndarray, np.ndarray, dict[str, list]]:
     base = np.array([min(max(0.0, low), high) for low, high in clips])
     # each action moves up, or down where its base is its upper limit
     change = np.array([min(0.5, high - at) or low - at for at, (low, high) in zip(base, clips, strict=True)])
-    biases = [env.memory("encoder bias")] if env._layout.biased else []
-    drawn = [bias.clone() for bias in biases]
-    for bias in biases:
-        bias.zero_()  # world 0 has a random encoder bias, the robot of the exported policy has none
+    differ = [env.memory("encoder bias")] if env._layout.biased else []
+    own: list[Any] = [0.0 for _ in differ]
+    differ += env.values.values()
+    own += [torch.tensor(scene.values[name][0], dtype=torch.float32) for name in env.values]
+    drawn = [each.clone() for each in differ]
+    for each, value in zip(differ, own, strict=True):
+        each[:] = value  # world 0 has a random encoder bias and gear, the robot of the exported policy has its own
     rows = _measure(env, base, change)
     for _ in range(MOST_ROUNDS):
         if not _shorten(env, rows, base, change):
             break
         rows = _measure(env, base, change)
-    for bias, before in zip(biases, drawn, strict=True):
-        bias.copy_(before)
+    for each, before in zip(differ, drawn, strict=True):
+        each.copy_(before)
     env.reset()
     scale, offset = [], []
     names = ("stiffness", "damping", "force_limit", "delay_steps", "action_kind", "armature")

@@ -334,7 +334,7 @@ class World:
         if name not in self._layout.values:
             if self.scene.values[name].shape[0] == 1:
                 return self.scene.values[name][0]
-            self._layout.differing.add(name)
+            self._layout.unequal.add(name)
         return self.read(f"value_{name}", int(np.prod(shape))).reshape(shape)
 
     def user(self, term: Any) -> Any:

@@ -147,7 +147,7 @@ class Storage:
             own = torch.tensor(layout.scene.values[name][0], dtype=torch.float32, device=self.device)
             self._firsts[f"value_{name}"] = own
             self.values[name] = self._add(f"value_{name}", self._zeros(self.worlds, *own.shape))
-        for name in sorted(layout.differing):
+        for name in sorted(layout.unequal):
             every = torch.tensor(layout.scene.values[name], dtype=torch.float32, device=self.device)
             self._firsts[f"value_{name}"] = self._add(f"value_{name}", every).clone()
         if layout.users:

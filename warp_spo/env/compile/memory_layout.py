@@ -28,7 +28,7 @@ class MemoryLayout:
             remember something.
         tables: numbers that all worlds share, by their names in kernels. table_names: names that terms give them.
         weights: of rewards.
-        values: names of the scene's values that events change. differing: of those that stages read, and that differ
+        values: names of the scene's values that events change. unequal: of those that stages read, and that differ
             between worlds of the scene itself.
         guard: what ends worlds whose numbers are out of bounds.
         outputs: names under which kernels write results ("reward", a group of observations, ...), by result.
@@ -57,7 +57,7 @@ class MemoryLayout:
         self.memory: dict[str, tuple[int, int, float | None]] = {}
         self.memory_size = 0
         self.unsaid: set[str] = set()  # names whose value at a reset nobody has said
-        self.differing: set[str] = set()
+        self.unequal: set[str] = set()
         self.frames: list[Any] = []
         self.drawn: dict[str, Any] = {}
         self.observations: dict[Any, int] = {}

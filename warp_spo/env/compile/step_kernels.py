@@ -194,6 +194,7 @@ class Tracing:
         fresh = World(self.layout, stage)
         fresh.before, fresh.lasting = self.ended if intervals else None, True
         fresh.present = dict(later.present)
+        fresh.__dict__["time"] = 0.0
         fresh.__dict__["q"] = vector(float(x) for x in self.layout.default_q)
         fresh.__dict__["qd"] = vector(0.0 for _ in range(w.scene.dof_count))
         for event in self.events:
@@ -206,7 +207,7 @@ class Tracing:
             if intervals:
                 left = left - 1.0
                 changed = World(self.layout, stage)
-                changed.__dict__.update(q=q.copy(), qd=qd.copy())
+                changed.__dict__.update(q=q.copy(), qd=qd.copy(), time=w.time)
                 change(event, changed, self.events)
                 q, qd = self._merge(w, q, qd, changed, left < 0.5, f"event {number}")
                 due = done | (left < 0.5)
@@ -300,7 +301,7 @@ class Tracing:
             w._stage.store(array, i, as_value(value))
             if later is not None:
                 name = array.removeprefix("value_")
-                later.present.setdefault(name, later.value(name).copy()).reshape(-1)[i] = value
+                later.present.setdefault(name, later.value(name).astype(object)).reshape(-1)[i] = value
 
     def _first(self) -> None:
         """Draw what is drawn once: values of the scene, and memory."""
@@ -397,7 +398,7 @@ class Tracing:
     def _store_reports(self, w: World, done: Condition, later: World) -> None:
         """Store what observations read of a step, as it is in the state in which worlds start where ``done`` holds."""
         start = World(self.layout, w._stage)
-        start.__dict__.update(q=later.q, qd=later.qd)
+        start.__dict__.update(q=later.q, qd=later.qd, time=0.0)
         start.present, start.kept = later.present, dict(w.kept)
         for name, (_, size, reset) in self.layout.memory.items():
             if reset is not None:
