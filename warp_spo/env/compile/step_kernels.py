@@ -19,7 +19,7 @@ from ..observations import Observation, name_of
 from ..world import World
 from .fused_kernel import FusedKernel
 from .memory_layout import MemoryLayout
-from .returned import change, commands_drawn, condition, controls, one_number
+from .returned import checked_event, commands_drawn, condition, controls, one_number
 from .vectors import Vector, as_value, vector
 
 LARGEST = 1e30  # numbers beyond it count as not finite
@@ -67,6 +67,7 @@ class Tracing:
                         "Env: events has two encoder_bias; expected one, whose names= are several expressions"
                     )
                 layout.biased = World(layout, FusedKernel("none", 0)).joints(event.names)
+        self.events = [checked_event(event, i) for i, event in enumerate(events)]
         self.ends = [*terminations, NOT_FINITE]
         names = ("act", "judge", "observe", "reset", "start", "final")
         self.stages = {name: FusedKernel(name, stream) for stream, name in enumerate(names)}
@@ -188,7 +189,7 @@ class Tracing:
         fresh.__dict__["qd"] = vector(0.0 for _ in range(w.scene.dof_count))
         for event in self.events:
             if isinstance(event, Reset):
-                change(event, fresh, self.events)
+                event.change(fresh)
         q, qd = w.q.copy(), w.qd.copy()
         for number, event in enumerate(each for each in self.events if isinstance(each, Interval)):
             name, due = f"until event {number}", done
@@ -197,7 +198,7 @@ class Tracing:
                 left = left - self.layout.step_dt
                 changed = World(self.layout, stage)
                 changed.__dict__.update(q=q.copy(), qd=qd.copy())
-                change(event, changed, self.events)
+                event.change(changed)
                 q, qd = self._merge(w, q, qd, changed, left <= 0.0, f"event {number}")
                 due = done | (left <= 0.0)
             w.keep(name, choose(due, [w.uniform(*event.seconds)], [left], name))
@@ -256,7 +257,7 @@ class Tracing:
         """Store what an event makes of values where ``due`` holds; None: everywhere."""
         drawn = World(self.layout, w._stage)
         drawn.values = {name: w.scene.values[name][0].astype(object) for name in event.names}
-        change(event, drawn, self.events)
+        event.change(drawn)
         entries: list[tuple[str, int]] = []
         news: Any = []
         for name in event.names:
@@ -315,8 +316,8 @@ class Tracing:
         of_rows: dict[int, World] = {}
         for group, terms in self.groups.items():
             name, at, starts = self.layout.output(kind + group), 0, [0]
-            for i, term in enumerate(terms):
-                rows, what = term.rows, f"observations[{group!r}][{i}] ({name_of(term)})"
+            for term in terms:
+                rows = term.rows
                 if rows:
                     self.apart.add(kind + group)
                     if rows not in of_rows:
@@ -325,10 +326,10 @@ class Tracing:
                         of_rows[rows] = begin(stage)
                     one, stage = of_rows[rows], of_rows[rows]._stage
                     for number in range(stage.at_once):
-                        stage.store_row(name, at, number, as_value(term.trace_row(one, number, what)))
+                        stage.store_row(name, at, number, as_value(term.trace_row(one, number)))
                     at += rows
                 else:
-                    for value in term.trace(w, what):
+                    for value in term.trace(w):
                         w._stage.store(name, at, as_value(value))
                         at += 1
                 starts.append(at)
