@@ -2,7 +2,7 @@
 
     python -m benchmarks.mdp [TASK ...] [--worlds 32] [--steps 500] [--seed 0] [--json FILE]
 
-Random actions drive the worlds of a task on the CPU, from none in the first world to a deviation of 1 in the last, at
+Random actions drive the worlds of a task on the CPU, from none in the first world to a deviation of 3 in the last, at
 random ages, with resets of random worlds and one action that is not a number. From the states, contact reports and
 commands of each step, rewards, observations before and after new starts, ends, time-outs, controls, sums of rewards
 and the curriculum of the terrain are computed again by the formulas of the tasks' pages; MuJoCo reads the robots and
@@ -20,6 +20,7 @@ from typing import Any
 import warp as wp
 
 from .. import command_line
+from ..table import runner
 from .comparison import Comparison
 from .tasks import TASKS
 
@@ -60,7 +61,10 @@ def main(argv: list[str] | None = None) -> int:
         for what, seen in row["faults"].items():
             print(f"    {what}: {seen}", flush=True)
     if options.json:
-        options.json.write_text(json.dumps(rows, indent=1) + "\n")
+        command = " ".join(["python -m benchmarks.mdp", *(sys.argv[1:] if argv is None else argv)])
+        record = runner.record([])
+        found = {name: record[name] for name in ("date", "commit", "versions")} | {"command": command, "tasks": rows}
+        options.json.write_text(json.dumps(found, indent=1) + "\n")
     return int(any(row["faults"] for row in rows.values()))
 
 

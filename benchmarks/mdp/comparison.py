@@ -18,8 +18,8 @@ from .tasks import TASKS
 
 REWARD, OBSERVED = 1e-6, 1e-5  # largest errors of a reward, and of an observation
 SUMS = 1e-5  # of a reward's sum over an episode, over its size or 1
-LOUDEST = 1.0  # deviation of the actions of the last world; the first one's are zero
-RESETS = 47  # steps from one reset of random worlds to the next
+LOUDEST = 3.0  # deviation of the actions of the last world; the first one's are zero
+RESETS, CHOSEN = 47, 0.1  # steps from one reset of random worlds to the next, and the share of worlds
 FIVE_SIGMA = 5.0  # of a mean of noise
 GAPS = 10  # steps from one comparison of a report's gaps with those of the state to the next
 SPOILT = 50  # step in which the last world's action is NaN
@@ -72,7 +72,7 @@ class Comparison:
                 actions[-1, 0] = math.nan
             self._step(actions)
             if step % RESETS == 0:
-                chosen = self.random.random(worlds) < 0.3
+                chosen = self.random.random(worlds) < CHOSEN
                 observed, _ = env.reset(torch.tensor(chosen))
                 self.counts["resets"] += int(chosen.sum())
                 self._begin(chosen, observed)
@@ -147,7 +147,7 @@ class Comparison:
             seen["command"] = env.command.double().numpy()
         if seen["gap"] is not None and new.any():
             seen["gap"][new] = self.robot.gaps(seen["q"][new])
-        for name in ("force", "slip"):  # of the last step, of which a world that has just started has none
+        for name in ("force", "slip"):  # no step has led to a new start; no task observes slips
             if seen[name] is not None:
                 seen[name][new] = 0.0
         s = self._state(seen, self.length * env.step_dt, new)

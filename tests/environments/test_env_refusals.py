@@ -89,7 +89,7 @@ class Setting(actions.Effort):
 
 
 MASS = "body_mass"
-SEEN = r"Env: observations\['actor'\]\[1\] \(unnamed\) returned"
+SEEN = r"Env: the observation 'unnamed' \(test_env_refusals.py, line \d+\) returned"
 RETURNED = [
     (dict(observations={"actor": [Q, returns(None)]}), f"{SEEN} None; expected numbers"),
     (dict(observations={"actor": [Q, returns("x")]}), f"{SEEN} 'x'; expected numbers"),
@@ -99,7 +99,7 @@ RETURNED = [
     (dict(observations={"actor": [returns([])]}), r"terms of observations\['actor'\] returned no numbers"),
     (
         dict(observations={"actor": [Each(lambda w, row: w.q, [[1.0]] * 20)]}),
-        r"\(lambda row|returned for a row an array",
+        "returned for a row an array",
     ),
     (dict(rewards={"up": (1.0, returns(None))}), "Env: reward 'up' returned None; expected one number"),
     (dict(rewards={"up": (1.0, Q)}), r"reward 'up' returned an array of shape \(2,\); expected one number"),

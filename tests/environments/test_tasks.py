@@ -234,6 +234,40 @@ def test_the_ground_is_drawn_where_it_is():
             assert renderer.depth.numpy()[0, 75, 100] == pytest.approx(3.0, abs=0.03)  # nearest of a pixel
 
 
+def test_a_large_field_is_coarse_far_away_alone():
+    """Near what is looked at all lines are drawn, and a picture of it is the same; beyond, one of eight."""
+    heights = np.random.default_rng(0).uniform(0.0, 0.1, (400, 200))
+    field, camera = spo.HeightField(heights, 0.05), Camera(distance=1.0, elevation=1.2, width=80, height=50)
+    looked = np.array([[5.0, 5.0, 0.0], [6.0, 5.0, 0.0]])
+    coarse, whole = (Renderer([], 0, field, camera, around=around) for around in (looked, None))
+    x, y, z = coarse.model.shape_source[0].vertices.T
+    assert len(x) < 0.4 * heights.size
+    inside = (x > 2.1) & (x < 8.9) & (y > 2.1) & (y < 7.9)
+    assert inside.sum() == len(np.arange(43, 178)) * len(np.arange(43, 158))
+    at = np.rint(np.stack([x, y]) / 0.05).astype(int)
+    held = (at >= 0).all(axis=0) & (at[0] < 400) & (at[1] < 200)
+    assert np.allclose(z[held], heights[at[0][held], at[1][held]], atol=1e-6)
+    seen = [each.draw(np.zeros((0, 7)), looked[0]) for each in (coarse, whole)]
+    assert np.array_equal(*seen) and seen[0].std() > 1.0
+
+
+def test_a_film_says_how_far_it_is(capsys):
+    """Its seconds are those measured from the second picture on; a short film says nothing."""
+    times = iter(np.concatenate([[50.0], 50.0 + 0.5 * np.arange(1, 100)]))
+    progress = films.Progress(60, lambda: next(times))
+    for done in range(1, 61):
+        progress.show(done)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [
+        "picture 2 of 60: 0.50 s each, 29 s left", "picture 23 of 60: 0.50 s each, 18 s left",
+        "picture 44 of 60: 0.50 s each, 8 s left",
+    ]  # fmt: skip
+    short = films.Progress(9, iter(np.arange(0.0, 5.0, 0.5)).__next__)
+    for done in range(1, 10):
+        short.show(done)
+    assert not capsys.readouterr().err
+
+
 def test_a_marker_is_in_its_own_picture_alone():
     robot, camera = robots.load("cartpole"), Camera(distance=4.0, width=120, height=75)
     balls = [Primitive("sphere", -1, (0.1,), (x, -0.5, 1.0, 0, 0, 0, 1), (0.0, 0.0, 1.0)) for x in (-0.3, 0.3)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -85,14 +86,9 @@ class Observation:
         check_steps(call, "delay", self.delay)
         check_whole(call, "history", self.history, 1)
 
-    def trace(
-        self, w: World, what: str = "an observation", admit: Callable[[Vector], Vector] = lambda values: values
-    ) -> Vector:
-        """Return the numbers; ``what`` names the observation in errors.
-
-        ``admit`` returns of what is measured what may be seen and remembered.
-        """
-        values = numbers(f"{what} returned", self.term(w))
+    def trace(self, w: World, admit: Callable[[Vector], Vector] = lambda values: values) -> Vector:
+        """Return the numbers; ``admit`` returns of what is measured what may be seen and remembered."""
+        values = numbers(f"the observation {place_of(self)} returned", self.term(w))
         if self.bias > 0.0:
             values = values + w.drawn(
                 f"bias {w.number(self)}", len(values), lambda s: [s.uniform(-self.bias, self.bias) for _ in values]
@@ -126,9 +122,10 @@ class Observation:
         plain = self.bias == 0.0 and self.history == 1 and check_steps("Observation", "delay", self.delay) == (0, 0)
         return len(self.term.rows) if isinstance(self.term, Each) and plain and len(self.term.rows) >= MANY else 0
 
-    def trace_row(self, w: World, number: int, what: str = "an observation") -> Any:
-        """Return the number of a row of the thread; ``what`` names the observation in errors."""
-        found = one_number(f"{what} returned for a row", self.term.of_own_row(w, number))  # type: ignore[attr-defined]
+    def trace_row(self, w: World, number: int) -> Any:
+        """Return the number of a row of the thread."""
+        returned = self.term.of_own_row(w, number)  # type: ignore[attr-defined]
+        found = one_number(f"the observation {place_of(self)} returned for a row", returned)
         value = self._measurement(w, found)
         if w.kept:
             function = self.term.function  # type: ignore[attr-defined]
@@ -193,6 +190,14 @@ def name_of(observation: Observation) -> str:
     if module == __name__ or (module.startswith(PACKAGE) and named == "term"):
         named = path[0]
     return "unnamed" if named == "<lambda>" else named.split(".")[-1].replace("_", " ")
+
+
+def place_of(observation: Observation) -> str:
+    """Return how errors name an observation: its name, and the file and line of its function if that has them."""
+    term: Any = observation.term
+    code = getattr(term.function if isinstance(term, Each) else term, "__code__", None)
+    at = "" if code is None else f" ({Path(code.co_filename).name}, line {code.co_firstlineno})"
+    return f"{shown(name_of(observation))!r}{at}"
 
 
 def base_velocity(w: World) -> Vector:

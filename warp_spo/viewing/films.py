@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,7 @@ from ..scene.scene import Scene
 from .renderer import Camera, Renderer
 from .shapes import Primitive, size_of
 
+PATIENCE, PERIOD = 5.0, 10.0  # a film says how far it is if it takes longer than this, and as often as this [s]
 STEADY = 0.25  # a camera that follows keeps its height where the robot's changes less, over the camera's distance
 
 
@@ -32,6 +36,9 @@ def pictures(
         follow: whether the camera moves with the first body; otherwise it looks at the first body's first place.
         markers, captions: for each picture, or none. Markers are fixed to the world.
         device: Warp device that draws.
+
+    What takes longer than five seconds says on stderr how far it is, what a picture costs on this machine, as measured
+    from the second one on, and how much time is left.
     """
     from PIL import Image, ImageDraw
 
@@ -44,14 +51,41 @@ def pictures(
     elif np.ptp(looked[:, 2]) < STEADY * camera.distance:
         looked[:, 2] = looked[:, 2].mean()
     beside = list(dict.fromkeys(marker for some in markers for marker in some))
-    renderer = Renderer(shapes, scene.body_count, scene.ground, camera, beside, device)
-    found = []
+    renderer = Renderer(shapes, scene.body_count, scene.ground, camera, beside, device, looked)
+    found, progress = [], Progress(len(q))
     for i in range(len(q)):
         picture = Image.fromarray(renderer.draw(poses[i], looked[i], markers[i] if len(markers) else ()))
         if len(captions):
             ImageDraw.Draw(picture).text((8, 6), captions[i], fill=(40, 44, 52))
         found.append(picture)
+        progress.show(i + 1)
     return found
+
+
+class Progress:
+    """The progress of a film, on stderr: what a picture costs here, as measured, and how long the others will take.
+
+    The first picture, which loads kernels, does not count. A film that is done sooner than PATIENCE says nothing.
+
+    Args:
+        count: of pictures. clock: returns the time [s].
+    """
+
+    def __init__(self, count: int, clock: Callable[[], float] = time.perf_counter):
+        self.count, self.clock = count, clock
+        self.began = self.told = math.nan
+
+    def show(self, done: int) -> None:
+        """Print a line after so many pictures, if it is time for one."""
+        now = self.clock()
+        if done == 1:
+            self.began, self.told = now, -math.inf
+            return
+        each = (now - self.began) / (done - 1)
+        left = each * (self.count - done)
+        if now - self.told > PERIOD and left > (PATIENCE if self.told == -math.inf else 0.0):
+            print(f"picture {done} of {self.count}: {each:.2f} s each, {left:.0f} s left", file=sys.stderr, flush=True)
+            self.told = now
 
 
 def save(frames: Sequence[Any], path: str | Path, seconds: float) -> Path:

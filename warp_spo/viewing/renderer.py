@@ -21,6 +21,8 @@ SQUARES = (200, 207, 214), (214, 219, 224)  # colours of the ground
 SQUARE = 1.0  # edge of one [m]
 EDGE = 200.0  # how far the ground goes on [m]
 HAZE = 8.0  # where the ground has faded to 37 %, over the distance of the camera
+NEAR = 3.0  # how far about what is looked at a field has all its lines, over the distance of the camera
+COARSE = 8  # farther away it has one of so many
 GROWTH = 2e-4  # of a shape over the one before
 SAMPLES = 4  # rays a pixel
 AWAY = (0.0, 0.0, -1e3, 0.0, 0.0, 0.0, 1.0)  # pose of a marker that a picture does not show
@@ -62,17 +64,19 @@ class Renderer:
         camera: from where; pictures have its size.
         markers: primitives of the world that some pictures show.
         device: Warp device that draws.
+        around: points that pictures look at [point, 3] [m]; far from them a field of heights is coarse. None: nowhere.
     """
 
     def __init__(
         self, shapes: Sequence[Primitive], bodies: int, ground: Any, camera: Camera,
-        markers: Sequence[Primitive] = (), device: Any = "cpu",
+        markers: Sequence[Primitive] = (), device: Any = "cpu", around: np.ndarray | None = None,
     ):  # fmt: skip
         import newton
         from newton.sensors import SensorCamera
 
         builder = newton.ModelBuilder()
-        builder.add_shape_mesh(-1, mesh=_ground_mesh(ground), color=(1.0, 1.0, 1.0))
+        mesh = _ground_mesh(ground, around, NEAR * camera.distance)
+        builder.add_shape_mesh(-1, mesh=mesh, color=(1.0, 1.0, 1.0))
         first = [builder.add_body() for _ in range(bodies + len(markers))][bodies:]
         self.markers = dict(zip(markers, first, strict=True))
         for i, (shape, body) in enumerate([*((each, each.body) for each in shapes), *self.markers.items()]):
@@ -126,8 +130,12 @@ class Renderer:
         return (self.sky + clear * (color - self.sky)).astype(np.uint8)
 
 
-def _ground_mesh(ground: Any) -> Any:
-    """Return a mesh of the ground, with squares; a field goes on as it is at its edges, like a plane."""
+def _ground_mesh(ground: Any, around: np.ndarray | None = None, near: float = 0.0) -> Any:
+    """Return a mesh of the ground, with squares; a field goes on as it is at its edges, like a plane.
+
+    Farther than ``near`` [m] from the points ``around``, if there are any, a field has one of COARSE lines, because
+    Newton prepares a million points for 20 s.
+    """
     import newton
 
     table, origin, cells = np.zeros((1, 1)), (0.0, 0.0, 0.0), (1.0, 1.0)
@@ -135,6 +143,9 @@ def _ground_mesh(ground: Any) -> Any:
         table, origin, cells = ground.heights, ground.origin, ground.cells
     heights = np.pad(table if table.ndim == 2 else table[0], 1, mode="edge") + origin[2]
     lines = [origin[axis] + cells[axis] * np.arange(-1.0, heights.shape[axis] - 1.0) for axis in (0, 1)]
+    if around is not None:
+        kept = [_lines_kept(line, each, near) for line, each in zip(lines, around.T, strict=False)]
+        lines, heights = [line[each] for line, each in zip(lines, kept, strict=True)], heights[np.ix_(*kept)]
     for line in lines:
         line[[0, -1]] += -EDGE, EDGE
     x, y = np.meshgrid(*lines, indexing="ij")
@@ -148,3 +159,11 @@ def _ground_mesh(ground: Any) -> Any:
     squares[:64, :64] = squares[64:, 64:] = SQUARES[0]
     places = corners[:, :2] / (2.0 * SQUARE)
     return newton.Mesh(corners, faces, uvs=places, compute_inertia=False, texture=squares)
+
+
+def _lines_kept(line: np.ndarray, around: np.ndarray, near: float) -> np.ndarray:
+    """Return the numbers of a grid's lines that are drawn: those near some places, one of COARSE beyond, both ends."""
+    count = len(line)
+    close = (line > around.min() - near) & (line < around.max() + near)
+    ends = (np.arange(count) < 2) | (np.arange(count) > count - 3)  # the last two are as high as each other
+    return np.flatnonzero(close | ends | (np.arange(count) % COARSE == 0))

@@ -69,12 +69,6 @@ class MemoryLayout:
         self.sensors: dict[str, tuple[int, float | None, Any]] = {}
         self.outputs: dict[str, str] = {}
 
-    @property
-    def control_sizes(self) -> dict[str, int]:
-        """How many entries each array has that actions may set."""
-        scene = self.scene
-        return {"ctrl": len(scene.actuators), "tau": scene.dof_count, "target_q": scene.coord_count}
-
     def remember(self, name: str, size: int, reset: Any = LEFT_OUT) -> int:
         """Return where ``size`` numbers of this name are in the memory.
 
@@ -141,3 +135,9 @@ class MemoryLayout:
         if name not in self.frames:
             self.frames.append(name)
         return self.frames.index(name)
+
+    @property
+    def control_sizes(self) -> dict[str, int]:
+        """How many entries each array has that actions may set."""
+        scene = self.scene
+        return {"ctrl": len(scene.actuators), "tau": scene.dof_count, "target_q": scene.coord_count}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -56,24 +57,29 @@ def condition(what: str, value: Any) -> Condition:
     raise TypeError(f"Env: {what} {came(value)}; expected a comparison, such as w.q[1] > 0.3")
 
 
-def change(event: Any, w: World, events: list) -> None:
-    """Let an event, one of ``events``, change the state or the values of a world.
+def checked_event(event: Any, number: int) -> Any:
+    """Return an event, ``events[number]``, whose change checks what it assigns: as many numbers as there are.
 
-    Raises:
-        TypeError, ValueError: it assigns no numbers, or not as many as there are; the message names it.
+    Its errors are those of :func:`numbers`, and one for a value that is not among the event's names.
     """
-    what, values = f"events[{events.index(event)}]", {*w.values}
-    state = {"q": w.scene.coord_count, "qd": w.scene.dof_count}
-    event.change(w)
-    for name in state.keys() & w.__dict__.keys():
-        w.__dict__[name] = numbers(f"{what} sets w.{name} to", w.__dict__[name], state[name])
-    if unknown := sorted({*w.values} - values):
-        raise ValueError(
-            f"Env: {what} sets w.values[{unknown[0]!r}]; expected one of its names, {', '.join(sorted(values))}"
-        )
-    for name in values:
-        own = w.scene.values[name][0]
-        w.values[name] = numbers(f"{what} sets w.values[{name!r}] to", w.values[name], own.size).reshape(own.shape)
+    what = f"events[{number}] sets"
+
+    def change(w: World) -> None:
+        state, values = {"q": w.scene.coord_count, "qd": w.scene.dof_count}, {*w.values}
+        event.change(w)
+        for name in state.keys() & w.__dict__.keys():
+            w.__dict__[name] = numbers(f"{what} w.{name} to", w.__dict__[name], state[name])
+        if unknown := sorted({*w.values} - values):
+            raise ValueError(
+                f"Env: {what} w.values[{unknown[0]!r}]; expected one of its names, {', '.join(sorted(values))}"
+            )
+        for name in values:
+            own = w.scene.values[name][0]
+            w.values[name] = numbers(f"{what} w.values[{name!r}] to", w.values[name], own.size).reshape(own.shape)
+
+    checked = copy.copy(event)
+    object.__setattr__(checked, "change", change)  # frozen
+    return checked
 
 
 def commands_drawn(commands: Any, w: World, done: Any) -> dict[str, Vector]:

@@ -25,7 +25,7 @@ from . import starts
 from .fused_kernel import FusedKernel
 from .guard import BEYOND, LARGEST, NOT_FINITE, Check, first, within
 from .memory_layout import MemoryLayout
-from .returned import change, commands_drawn, condition, controls, one_number
+from .returned import checked_event, commands_drawn, condition, controls, one_number
 from .vectors import Vector, as_value, vector
 
 CHOSEN_WORLD = "chosen.data[world]"  # C++: the world has just started anew
@@ -62,6 +62,7 @@ class Tracing:
                         "Env: events has two encoder_bias; expected one, whose names= are several expressions"
                     )
                 layout.biased = World(layout, FusedKernel("none", 0)).joints(event.names)
+        self.events = [checked_event(event, i) for i, event in enumerate(events)]
         self.ends = [*terminations, NOT_FINITE, BEYOND]
         names = ("act", "judge", "observe", "reset", "start", "final")
         self.stages = {name: FusedKernel(name, stream) for stream, name in enumerate(names)}
@@ -199,7 +200,7 @@ class Tracing:
         fresh.__dict__["qd"] = vector(0.0 for _ in range(w.scene.dof_count))
         for event in self.events:
             if isinstance(event, Reset):
-                change(event, fresh, self.events)
+                event.change(fresh)
         q, qd = w.q.copy(), w.qd.copy()
         for number, event in enumerate(each for each in self.events if isinstance(each, Interval)):
             name, due = f"until event {number}", done
@@ -208,7 +209,7 @@ class Tracing:
                 left = left - 1.0
                 changed = World(self.layout, stage)
                 changed.__dict__.update(q=q.copy(), qd=qd.copy(), time=w.time)
-                change(event, changed, self.events)
+                event.change(changed)
                 q, qd = self._merge(w, q, qd, changed, left < 0.5, f"event {number}")
                 due = done | (left < 0.5)
             w.keep(name, choose(due, [self._wait(w, event.seconds)], [left], name))
@@ -279,7 +280,7 @@ class Tracing:
         """Store what an event makes of values where ``due`` holds; None: everywhere. ``later`` has what is stored."""
         drawn = World(self.layout, w._stage)
         drawn.values = {name: w.scene.values[name][0].astype(object) for name in event.names}
-        change(event, drawn, self.events)
+        event.change(drawn)
         if drawn.kept:
             raise ValueError(
                 f"events.Values: {event.change} keeps {', '.join(map(shown, drawn.kept))}; expected changes of values "
@@ -355,8 +356,8 @@ class Tracing:
         checks: list[Check] = []
         for group, terms in self.groups.items():
             name, at, starts = self.layout.output(kind + group), 0, [0]
-            for i, (cause, term) in enumerate(zip(term_causes(group, terms), terms, strict=True)):
-                rows, what = term.rows, f"observations[{group!r}][{i}] ({name_of(term)})"
+            for cause, term in zip(term_causes(group, terms), terms, strict=True):
+                rows = term.rows
                 if rows:
                     self.apart.add(kind + group)
                     if rows not in of_rows:
@@ -367,12 +368,12 @@ class Tracing:
                     goes = steps_on(one) if kind == "" else None
                     for number in range(stage.at_once):
                         found: list[Check] = []
-                        (value,) = self.guard.admit(cause, [term.trace_row(one, number, what)], found)
+                        (value,) = self.guard.admit(cause, [term.trace_row(one, number)], found)
                         stage.store_row(name, at, number, as_value(value))
                         self.guard.leave_row(one, kind, cause, found[0], number, goes)
                     at += rows
                 else:
-                    for value in term.trace(w, what, lambda values: self.guard.admit(cause, values, checks)):  # noqa: B023
+                    for value in term.trace(w, lambda values: self.guard.admit(cause, values, checks)):  # noqa: B023
                         w._stage.store(name, at, as_value(value))
                         at += 1
                 starts.append(at)
