@@ -33,7 +33,8 @@ WITHIN = 5e-3  # of a slowing or a gain, and of a rate that nothing changes; the
 LEFT = 1e-3  # of the first rate, after twice the time in which a sphere stops
 XML = """<mujoco><option timestep="{h}" cone="elliptic" impratio="{ratio}" gravity="{gx} 0 {gz}"/><worldbody>
 <geom type="plane" size="99 99 1" condim="1" friction="0.8 0 0"/>
-<body pos="0 0 {r}"><freejoint/><geom type="sphere" size="{r}" mass="{m}" condim="6" friction="0.8 {spin} {roll}"/></body></worldbody></mujoco>"""
+<body pos="0 0 {r}"><freejoint/>
+<geom type="sphere" size="{r}" mass="{m}" condim="6" friction="0.8 {spin} {roll}"/></body></worldbody></mujoco>"""
 
 
 class Case(NamedTuple):
