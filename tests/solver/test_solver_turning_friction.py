@@ -1,5 +1,7 @@
 """SolverSPO's torsional and rolling friction: where shapes ask for it as SolverMuJoCo has it; on a tape."""
 
+import itertools
+
 import newton
 import numpy as np
 import pytest
@@ -56,7 +58,7 @@ def test_changes_are_taken_and_what_has_no_such_friction_is_named():
     found = model(6)
     solver = SolverSPO(found, pairs=[])
     found.shape_material_mu_rolling.fill_(0.05)
-    with pytest.raises(ValueError, match="shape_material_mu_rolling is 0.05"):
+    with pytest.raises(ValueError, match=r"shape_material_mu_rolling is 0\.05"):
         solver.check_model()
     with pytest.warns(UserWarning, match="shape_material_mu_rolling folded into the kernels"):
         solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
@@ -77,7 +79,7 @@ def test_a_tape_differentiates_steps(device):
         states = [found.state(requires_grad=tape is not None) for _ in range(4)]
         states[0].joint_qd.assign(np.asarray(rates, np.float32))
         with tape or wp.ScopedTimer("", active=False):
-            for before, after in zip(states[:-1], states[1:], strict=True):
+            for before, after in itertools.pairwise(states):
                 solver.step(before, after, None, None, H)
         return states
 

@@ -105,7 +105,7 @@ def touching_bodies(source: Source, moving: np.ndarray) -> tuple[int, int] | Non
     return None
 
 
-def _frictions(source: Source, geom: int, ground: int | None, pairs: Pairs) -> dict[str, float]:
+def _frictions(source: Source, geom: int, ground: int | None, pairs: Pairs) -> dict[str, Any]:
     """Return sliding, torsional and rolling friction of a geom on a ground, its own without one."""
     m = source.model
     pair = None if ground is None else pairs.get(frozenset((geom, ground)))

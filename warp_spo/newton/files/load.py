@@ -76,7 +76,8 @@ def load(
             ``contacts`` hold the result. A sphere and the ends of a capsule touch with their lowest point, a box with
             its corners. A mesh, a cylinder, a cone and an ellipsoid touch with ``points`` of their surface. Friction is
             the file's: MuJoCo's of the two geoms, Bullet's ``lateral_friction``, Gazebo's ``mu1``, a USD material's;
-            0.8 where a file has none.
+            0.8 where a file has none. Torsional and rolling friction are MuJoCo's with ``condim`` 4 and 6, and Bullet's
+            ``spinning_friction`` and ``rolling_friction``.
         ground: The ground that they touch. None: the file's plane or height field; without one, the plane at height
             zero, but no contacts for contacts=True of an MJCF file, which a warning says.
         points: Of a shape that is the hull of points, at most.

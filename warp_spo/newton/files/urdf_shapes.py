@@ -25,7 +25,8 @@ def urdf_shapes(
 ) -> list[CollisionShape]:
     """Return the <collision> elements of the links, of which link k is body k, in float64.
 
-    Friction is that of Bullet's <contact><lateral_friction> in the link, or of <mu1> in a <gazebo> of the link.
+    Friction is that of Bullet's <contact><lateral_friction> in the link, or of <mu1> in a <gazebo> of the link;
+    torsional and rolling friction are Bullet's <spinning_friction> and <rolling_friction>.
 
     Args:
         labels: of the bodies. origin: reads the position and the quaternion of an element's <origin>.
@@ -42,11 +43,11 @@ def urdf_shapes(
                 raise collision.error("no <geometry>; expected one; write it")
             name = collision.get("name") or (label if len(elements) == 1 else f"{label}:{number}")
             pose = np.concatenate(origin(collision))
-            friction = _urdf_friction(robot, link)
+            frictions = _urdf_frictions(robot, link)
             for shape in geometry:
                 if shape.tag in KINDS:
                     kind, sizes, names = _urdf_sizes(shape)
-                    found.append(CollisionShape(name, body, kind, pose, sizes, friction=friction, names=names))
+                    found.append(CollisionShape(name, body, kind, pose, sizes, names=names, **frictions))
                 else:
                     found.append(CollisionShape(name, body, f"<{shape.tag}>", pose))
     return found
@@ -99,11 +100,23 @@ def _vertices(shape: Any, file: Any) -> np.ndarray:
     return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
 
 
-def _urdf_friction(robot: XmlElement, link: Any) -> float | None:
+BULLET = {
+    "friction": "lateral_friction",
+    "torsional_friction": "spinning_friction",
+    "rolling_friction": "rolling_friction",
+}
+"""Elements of a link's <contact> that give frictions."""
+
+
+def _urdf_frictions(robot: XmlElement, link: Any) -> dict[str, Any]:
+    """Return the frictions that a link gives, by name."""
     contact = link.child("contact")
-    bullet = None if contact is None else contact.child("lateral_friction")
-    if bullet is not None:
-        return bullet.number("value", least=0.0)
+    given = {name: None if contact is None else contact.child(tag) for name, tag in BULLET.items()}
+    found = {name: one.number("value", least=0.0) for name, one in given.items() if one is not None}
+    return {"friction": _gazebo_friction(robot, link)} | found
+
+
+def _gazebo_friction(robot: XmlElement, link: Any) -> float | None:
     for gazebo in robot.findall("gazebo"):
         mu: Any = gazebo.find("mu1") if gazebo.get("reference") == link.get("name") else None
         if mu is not None:
