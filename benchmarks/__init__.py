@@ -17,7 +17,8 @@ Accuracy, mostly on a CPU:
 Contact:
     ``contact/``: times and errors, energy, every promised figure, other engines, gradients, terrain.
 Learning:
-    ``env_times`` (parts of a step of an environment), ``training`` (env-steps/s), ``learning_curves``.
+    ``env_times`` (parts of a step of an environment), ``training`` (env-steps/s), ``learning_curves``,
+    ``killed_trainings`` (``kill -9`` and ``--resume latest``; a CPU).
 Documentation and refactoring:
     ``blocks`` (code of pages), ``site``, ``site_pictures``, ``gallery``; ``kernel_texts`` (generated),
     ``env_digests`` (bits of the tasks' environments).

@@ -14,6 +14,7 @@ import os
 import signal
 import time
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from ..runtime.arrays import parse_device
 from . import training_files
 from .environment import Env
+from .loggers import checked
 from .runner import Runner, describe_end, load_checkpoint, run
 from .training_log import TrainingLog
 from .validation import check_folder
@@ -225,13 +227,16 @@ def pick_device(asked: str | None) -> str:
 
 def make_runner(
     env: Env, learner: Learner, folder: Path | None = None, save_interval: int = 100, every: int = 10,
-    began: float | None = None, seconds: float = math.inf,
+    began: float | None = None, seconds: float = math.inf, loggers: Sequence[str] = (),
 ) -> Runner:  # fmt: skip
     """Return rsl_rl's runner on an environment, which logs the training in ``folder``."""
     with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints every layer of both networks
         runner = Runner(env, learner.settings(env, save_interval), str(env.device))
     began = time.time() if began is None else began
-    log = TrainingLog(env, folder, every, began, runner.gpu_global_rank == 0, seconds, runner.end_iteration)
+    log = TrainingLog(
+        env, folder, every, began, runner.gpu_global_rank == 0, seconds, runner.end_iteration, loggers,
+        learner.steps * env.num_envs * runner.gpu_world_size, dataclasses.asdict(learner),
+    )  # fmt: skip
     runner.logger = log  # type: ignore[assignment]
     return runner
 
@@ -239,6 +244,7 @@ def make_runner(
 def prepare(
     env: Env, learner: Learner, folder: str | Path, iterations: int | None = None, resume: str | Path | None = None,
     seed: int = 0, save_interval: int = 100, every: int = 10, began: float | None = None, seconds: float = math.inf,
+    loggers: Sequence[str] | None = (),
 ) -> tuple[Runner, int]:  # fmt: skip
     """Return a runner that is ready to train, and how many iterations are left; see :func:`train`."""
     check_folder(folder, resume)
@@ -246,7 +252,7 @@ def prepare(
     folder = Path(folder)
     if str(resume) == training_files.LATEST:
         resume = training_files.newest(folder)  # None: a training that begins
-    runner = make_runner(env, learner, folder, save_interval, every, began, seconds)
+    runner = make_runner(env, learner, folder, save_interval, every, began, seconds, checked(loggers))
     first = load_checkpoint(runner, resume) + 1 if resume is not None else 0
     runner.logger.first = first  # type: ignore[attr-defined]
     total = learner.iterations if iterations is None else iterations
@@ -261,6 +267,7 @@ def prepare(
 def train(
     env: Env, learner: Learner, folder: str | Path, iterations: int | None = None, resume: str | Path | None = None,
     seed: int = 0, save_interval: int = 100, every: int = 10, began: float | None = None, seconds: float = math.inf,
+    loggers: Sequence[str] | None = (),
 ) -> Runner:  # fmt: skip
     """Train, and leave checkpoints ``model_N.pt``, ``last.pt`` with the worlds, and ``progress.jsonl`` in a folder.
 
@@ -281,13 +288,16 @@ def train(
         every: iterations from one printed line to the next.
         began: time from which seconds count, as of ``time.time``.
         seconds: after which no iteration starts, in any of the processes.
+        loggers: beside the rows of the folder: "tensorboard", "wandb"; None: TensorBoard where it is installed.
 
     Raises:
         ValueError: the folder holds another training, the checkpoint is not of this task, or nothing is left to do.
         OSError: there is no such checkpoint, or the folder cannot be made.
         FloatingPointError: learning made a policy that is not finite; the last one before is kept as a checkpoint.
     """
-    runner, left = prepare(env, learner, folder, iterations, resume, seed, save_interval, every, began, seconds)
+    runner, left = prepare(
+        env, learner, folder, iterations, resume, seed, save_interval, every, began, seconds, loggers
+    )
     ending = run(runner, left)
     if ending.fault:
         raise FloatingPointError(f"train: {describe_end(ending)}")
