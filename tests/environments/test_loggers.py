@@ -1,6 +1,7 @@
 """Loggers of trainings, read by their libraries' own readers."""
 
 import json
+import time
 import types
 
 import pytest
@@ -72,13 +73,13 @@ def test_an_offline_run_of_wandb_holds_the_tags(tmp_path, monkeypatch):
         monkeypatch.setenv(name, value)
     train_in_two_parts(tmp_path, "wandb")
     files = sorted(tmp_path.glob("wandb/offline-run-*/*.wandb"), key=lambda file: file.stat().st_mtime)
-    series, names = {}, set()
+    series, names, ends = {}, set(), time.monotonic() + 30.0
     for file in files:
-        for data in records(file.read_bytes()):
-            record = wandb_internal_pb2.Record()
-            record.ParseFromString(data)
-            items = {"/".join(item.nested_key) or item.key: json.loads(item.value_json)
-                     for item in record.history.item}  # fmt: skip
+        found = []
+        while not any(record.HasField("exit") for record in found) and time.monotonic() < ends:  # written behind
+            found = [wandb_internal_pb2.Record.FromString(data) for data in records(file.read_bytes())]
+        for record in found:
+            items = {"/".join(item.nested_key): json.loads(item.value_json) for item in record.history.item}
             names |= {record.run.run_id} if record.run.run_id else set()
             for tag, value in items.items():
                 series.setdefault(tag, {})[int(items["_step"])] = value
