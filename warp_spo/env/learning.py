@@ -101,7 +101,9 @@ class CapturedPPO(PPO):
         if torch.device(self.device).type != "cuda" or self.actor.is_recurrent or not self.captures:
             return super().act(obs)
         if self.graph is None:
-            super().act(obs)  # warms up
+            before = torch.cuda.get_rng_state(self.device)
+            super().act(obs)  # warms up, and draws nothing: a training that resumes has the same numbers
+            torch.cuda.set_rng_state(before, self.device)
             self.seen, graph = obs.clone(), torch.cuda.CUDAGraph()
             try:
                 with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # NCCL has threads of its own
@@ -183,7 +185,8 @@ class CapturedPPO(PPO):
         except FloatingPointError as error:
             terms = loss_terms(error)
             bad = [name for name, value in terms.items() if not math.isfinite(value)]
-            return f"loss {', '.join(bad)} not finite" if bad else "the gradient of a finite loss is not finite"
+            others = "the loss of another process" if self.is_multi_gpu else "the gradient of a finite loss"
+            return f"loss {', '.join(bad)} not finite" if bad else f"{others} is not finite"
         finally:
             hook.remove()
             self._keep(back=True)
