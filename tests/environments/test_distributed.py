@@ -74,18 +74,19 @@ def test_a_device_for_each_process_is_refused(capsys):
     assert "--gpus 2 with --device cuda:0; expected no --device, or cpu" in capsys.readouterr().err
 
 
-def torchrun(folder, *given, node=0, nodes=1, processes=1, port=0):
-    """Start torchrun for a training of the cart-pole on the CPU, with two worlds a process."""
-    command = [sys.executable, "-m", "torch.distributed.run", "--nnodes", str(nodes), "--node-rank", str(node)]
-    command += ["--nproc-per-node", str(processes), "--master-addr", "localhost", "--master-port", str(port), *given]
-    command += ["-m", "warp_spo.train", "cartpole", "--device", "cpu", "--worlds", "8", "--out", str(folder)]
+def torchrun(folder, port, *given):
+    """Start torchrun for a training of the cart-pole on the CPU, with eight worlds a process."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--rdzv-backend", "c10d", "--rdzv-id", "1"]
+    command += ["--rdzv-endpoint", f"localhost:{port}", "--local-addr", "localhost", *given[:4], "-m", "warp_spo.train"]
+    command += ["cartpole", "--device", "cpu", "--worlds", "8", "--out", str(folder), *given[4:]]
     own = {**os.environ, "PYTHONPATH": os.pathsep.join([str(pathlib.Path(__file__).parents[2]), *sys.path])}
-    return lambda *more: subprocess.Popen([*command, *more], env=own, stdout=subprocess.DEVNULL)
+    return subprocess.Popen(command, env=own, stdout=subprocess.DEVNULL)
 
 
 def test_two_nodes_have_the_bits_of_one_with_two_processes(tmp_path):
     last, port = {}, free_port()
-    nodes = [torchrun(tmp_path / "two", node=i, nodes=2, port=port)("--iterations", "3") for i in (0, 1)]
+    given = ("--nnodes", "2", "--nproc-per-node", "1", "--iterations", "3")
+    nodes = [torchrun(tmp_path / "two", port, *given) for _ in range(2)]
     assert [each.wait(timeout=300) for each in nodes] == [0, 0]
     assert train.main(["cartpole", "--device", "cpu", "--worlds", "8", "--gpus", "2", "--iterations", "3", "--out",
                        str(tmp_path / "one")]) == 0  # fmt: skip
@@ -100,17 +101,17 @@ def test_two_nodes_have_the_bits_of_one_with_two_processes(tmp_path):
 
 def test_torchrun_goes_on_after_a_killed_process(tmp_path):
     """With one restart, from the newest checkpoint, without --resume on the command line."""
-    process = torchrun(tmp_path, "--max-restarts", "1", processes=2, port=free_port())
-    process = process("--iterations", "30", "--save-interval", "1")
+    given = ("--max-restarts", "1", "--nproc-per-node", "2", "--iterations", "12", "--save-interval", "1")
+    process = torchrun(tmp_path, free_port(), *given)
     began = time.monotonic()
-    while not (tmp_path / "model_5.pt").exists() and time.monotonic() < began + 120.0:
+    while not (tmp_path / "model_3.pt").exists() and time.monotonic() < began + 120.0:
         time.sleep(0.05)
     workers = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout.split()
     os.kill(int(workers[-1]), signal.SIGKILL)
     assert process.wait(timeout=300) == 0
     rows = training_log.read_rows(tmp_path / "progress.jsonl")
-    assert [row["iteration"] for row in rows] == list(range(30))
-    assert torch.load(tmp_path / "last.pt", weights_only=True)["iter"] == 29
+    assert [row["iteration"] for row in rows] == list(range(12))
+    assert torch.load(tmp_path / "last.pt", weights_only=True)["iter"] == 11
 
 
 def test_two_processes_reach_the_return_of_one(tmp_path):
