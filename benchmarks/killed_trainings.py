@@ -9,27 +9,31 @@ and the next process has to go on from the newest of them; rows of the log have 
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import random
-import signal
-import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from warp_spo import train
 from warp_spo.env import training_files, training_log
+from warp_spo.env.tasks import task
 
 from . import command_line
 
 PATIENCE = 120.0  # for the first iteration of a process [s]
-MOST = 1.0  # from the first iteration to a kill [s]
+MOST = 1.5  # from the first iteration to a kill [s]
 
 
 def run(folder: Path, kills: int, seed: int = 0) -> dict[str, Any]:
     """Train in a folder, kill the training so many times, let it end, and return counts and what went wrong."""
+    torch.set_num_threads(1)
+    task("cartpole").build(8, "cpu")  # loads what all processes then have: they are forks of this one
     chance, faults, reached, parts = random.Random(seed), list[str](), -1, 0
     for kill in range(kills):
         process, first = start(folder)
@@ -41,8 +45,8 @@ def run(folder: Path, kills: int, seed: int = 0) -> dict[str, Any]:
         ends = time.monotonic() + MOST
         while kill % 2 and not list(folder.glob("*.part")) and time.monotonic() < ends:
             pass
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
+        process.kill()
+        process.join()
         parts += bool(list(folder.glob("*.part")))
         for file in folder.glob("*.pt"):
             try:
@@ -55,36 +59,36 @@ def run(folder: Path, kills: int, seed: int = 0) -> dict[str, Any]:
         if numbers[: reached + 1] != list(range(reached + 1)) or numbers != sorted(set(numbers)):
             faults.append(f"rows after kill {kill}: {numbers[-9:]}, with a checkpoint of {reached}")
     process, _ = start(folder, reached + 3)
-    process.communicate()
+    process.join()
     numbers = [int(row["iteration"]) for row in training_log.read_rows(folder / "progress.jsonl")]
-    if process.returncode or numbers != list(range(reached + 3)):
-        faults.append(f"at the end: status {process.returncode}, rows {numbers[-9:]}, expected up to {reached + 2}")
+    if process.exitcode or numbers != list(range(reached + 3)):
+        faults.append(f"at the end: status {process.exitcode}, rows {numbers[-9:]}, expected up to {reached + 2}")
     return {"kills": kills, "while a file was written": parts, "iterations": len(numbers), "faults": faults}
 
 
-def start(folder: Path, iterations: int = 10**6) -> tuple[subprocess.Popen, int | None]:
-    """Return a training, and the number of its first iteration once that is done; None if it has ended before."""
-    command = [sys.executable, "-m", "warp_spo.train", "cartpole", "--device", "cpu", "--worlds", "8", "--out",
-               str(folder), "--iterations", str(iterations), "--save-interval", "2", "--resume", "latest"]  # fmt: skip
-    root = str(Path(__file__).parents[1])
-    own = {**os.environ, "PYTHONPATH": os.pathsep.join([root, *sys.path])}
-    file, before = folder / "progress.jsonl", 0.0
-    if file.exists():
-        before = file.stat().st_mtime_ns
-    process = subprocess.Popen(command, env=own, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    watch = threading.Timer(PATIENCE, process.kill)
-    watch.start()
-    newest = training_files.newest(folder)
+def start(folder: Path, iterations: int = 10**6) -> tuple[Any, int | None]:
+    """Return a process that trains, and the number of its first iteration once that is done; None if it has ended."""
+    newest, file = training_files.newest(folder), folder / "progress.jsonl"
     known = 0 if newest is None else int(training_files.read(newest)["iter"]) + 1
-    while process.poll() is None:
-        if file.exists() and file.stat().st_mtime_ns != before:
+    before = file.stat().st_ino if file.exists() else None
+    process = multiprocessing.get_context("fork").Process(target=train_quietly, args=(folder, iterations))
+    process.start()
+    ends = time.monotonic() + PATIENCE
+    while process.is_alive() and time.monotonic() < ends:
+        if file.exists() and file.stat().st_ino != before:  # rows are taken over into a new file
             rows = [int(row["iteration"]) for row in training_log.read_rows(file)]
-            if len(rows) > known:  # those before have been taken over
-                watch.cancel()
+            if len(rows) > known:
                 return process, rows[known]
         time.sleep(2e-3)
-    watch.cancel()
-    return process, known if process.returncode == 0 else None
+    return process, known if process.exitcode == 0 else None
+
+
+def train_quietly(folder: Path, iterations: int) -> None:
+    """Train in this process as the command does, without words."""
+    for number in (1, 2):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+    command = ["cartpole", "--device", "cpu", "--worlds", "8", "--out", str(folder), "--logger", "none"]
+    sys.exit(train.main([*command, "--iterations", str(iterations), "--save-interval", "2", "--resume", "latest"]))
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -59,6 +59,10 @@ def start(given: list[str]) -> int:
         "--resume", type=Path, help="checkpoint to go on from; latest: the newest of the folder, if any"
     )
     parser.add_argument("--save-interval", type=count, help="iterations between checkpoints; left out: 100")
+    parser.add_argument(
+        "--logger", action="append", choices=("tensorboard", "wandb", "none"), dest="loggers",
+        help="beside progress.jsonl; left out: tensorboard where it is installed; may be repeated",
+    )  # fmt: skip
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes", help=SET)
     parser.add_argument("--settings", type=Path, metavar="FILE.toml", help="such settings in a file")
     options = parser.parse_args(given)
@@ -101,6 +105,7 @@ def learn(parser: Any, options: argparse.Namespace, chosen: Any, learner: Any, g
     from .env.task_files import build, short_name
     from .env.training_log import draw_curve
 
+    loggers = options.loggers and [each for each in options.loggers if each != "none"]
     rank, folder, worlds = int(os.environ.get("RANK", 0)), options.out, options.worlds
     name = short_name(options.task)
     try:
@@ -109,14 +114,14 @@ def learn(parser: Any, options: argparse.Namespace, chosen: Any, learner: Any, g
         print(f"{name}: {worlds} worlds on {device}, {time.time() - BEGAN:.1f} s", flush=True)
         runner, iterations = learning.prepare(
             env, learner, folder, options.iterations, options.resume, options.seed + rank, options.save_interval,
-            began=BEGAN, seconds=options.seconds,
+            began=BEGAN, seconds=options.seconds, loggers=loggers,
         )  # fmt: skip
         run = {"task": name, "command": shlex.join(["python", "-m", "warp_spo.train", *given]), "worlds": worlds,
                "processes": int(os.environ.get("WORLD_SIZE", 1)), "iterations": options.iterations,
                "seed": options.seed, "save_interval": options.save_interval}  # fmt: skip
         if rank == 0:
             settings.write(folder, run, learner, options.given)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError) as error:
         parser.error(str(error))
     ending = learning.run(runner, iterations)
     if rank == 0:

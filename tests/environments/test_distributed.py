@@ -2,14 +2,17 @@
 
 import os
 import pathlib
+import signal
 import socket
 import subprocess
 import sys
+import time
 
 import pytest
 import torch
 import torch.multiprocessing as processes
 
+from warp_spo import train
 from warp_spo.env import learning, make, training_log
 from warp_spo.env.tasks import task
 
@@ -66,11 +69,49 @@ def test_two_processes_learn_one_policy(tmp_path):
 
 
 def test_a_device_for_each_process_is_refused(capsys):
-    from warp_spo import train
-
     with pytest.raises(SystemExit):
         train.main(["cartpole", "--gpus", "2", "--device", "cuda:0"])
     assert "--gpus 2 with --device cuda:0; expected no --device, or cpu" in capsys.readouterr().err
+
+
+def torchrun(folder, port, *given):
+    """Start torchrun for a training of the cart-pole on the CPU, with eight worlds a process."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--rdzv-backend", "c10d", "--rdzv-id", "1"]
+    command += ["--rdzv-endpoint", f"localhost:{port}", "--local-addr", "localhost", *given[:4], "-m", "warp_spo.train"]
+    command += ["cartpole", "--device", "cpu", "--worlds", "8", "--out", str(folder), *given[4:]]
+    own = {**os.environ, "PYTHONPATH": os.pathsep.join([str(pathlib.Path(__file__).parents[2]), *sys.path])}
+    return subprocess.Popen(command, env=own, stdout=subprocess.DEVNULL)
+
+
+def test_two_nodes_have_the_bits_of_one_with_two_processes(tmp_path):
+    last, port = {}, free_port()
+    given = ("--nnodes", "2", "--nproc-per-node", "1", "--iterations", "3")
+    nodes = [torchrun(tmp_path / "two", port, *given) for _ in range(2)]
+    assert [each.wait(timeout=300) for each in nodes] == [0, 0]
+    assert train.main(["cartpole", "--device", "cpu", "--worlds", "8", "--gpus", "2", "--iterations", "3", "--out",
+                       str(tmp_path / "one")]) == 0  # fmt: skip
+    for name in ("two", "one"):
+        last[name] = torch.load(tmp_path / name / "last.pt", weights_only=True)
+    for part in ("actor_state_dict", "critic_state_dict"):
+        assert all(x.equal(last["one"][part][name]) for name, x in last["two"][part].items())
+    for one, two in zip(last["one"]["worlds"], last["two"]["worlds"], strict=True):
+        assert all(x.equal(two["env"][name]) for name, x in one["env"].items())
+        assert one["random"]["cpu"].equal(two["random"]["cpu"])
+
+
+def test_torchrun_goes_on_after_a_killed_process(tmp_path):
+    """With one restart, from the newest checkpoint, without --resume on the command line."""
+    given = ("--max-restarts", "1", "--nproc-per-node", "2", "--iterations", "12", "--save-interval", "1")
+    process = torchrun(tmp_path, free_port(), *given)
+    began = time.monotonic()
+    while not (tmp_path / "model_3.pt").exists() and time.monotonic() < began + 120.0:
+        time.sleep(0.05)
+    workers = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout.split()
+    os.kill(int(workers[-1]), signal.SIGKILL)
+    assert process.wait(timeout=300) == 0
+    rows = training_log.read_rows(tmp_path / "progress.jsonl")
+    assert [row["iteration"] for row in rows] == list(range(12))
+    assert torch.load(tmp_path / "last.pt", weights_only=True)["iter"] == 11
 
 
 def test_two_processes_reach_the_return_of_one(tmp_path):

@@ -243,10 +243,14 @@ def test_a_training_leaves_what_it_ran_with(tmp_path, capsys):
     capsys.readouterr()
     assert play.main(["cartpole", str(folder / "last.pt"), "--export", str(tmp_path / "policy")]) == 0
     assert "after 3 iteration(s)" in capsys.readouterr().out
-    (folder / "settings.toml").write_text("a = = 3")
-    with pytest.raises(SystemExit):
-        train.main(again)
-    assert "settings.toml': " in capsys.readouterr().err
+    for text, words in (
+        ("a = = 3", "settings.toml': "),
+        ('[run]\ntask = "cartpole"\nseed = "x"', "has run.seed = 'x'; exp"),
+    ):
+        (folder / "settings.toml").write_text(text)
+        with pytest.raises(SystemExit):
+            train.main(again)
+        assert words in capsys.readouterr().err
 
 
 def test_trees_are_written_as_toml_and_read_again(tmp_path):

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -191,6 +192,15 @@ def test_rows_of_a_full_disk_come_later(tmp_path):
     log.file.unlink()
     log.log(3, 9, 0.1, 0.1, {}, **others)
     assert [row["iteration"] for row in training_log.read_rows(log.file)] == [0, 1, 2, 3]
+
+
+def test_a_folder_that_is_lost_is_made_anew(tmp_path, monkeypatch):
+    """With all rows."""
+    meanwhile(monkeypatch, 1, lambda _: shutil.rmtree(tmp_path / "run"))
+    with pytest.warns(UserWarning, match="progress.jsonl' could not be written .No such file or directory.; its rows"):
+        learning.train(cart_env(), LEARNER, tmp_path / "run", 4, save_interval=2)
+    assert [row["iteration"] for row in training_log.read_rows(tmp_path / "run" / "progress.jsonl")] == [0, 1, 2, 3]
+    assert training_files.read(tmp_path / "run" / "last.pt")["iter"] == 3
 
 
 @pytest.fixture(scope="module")

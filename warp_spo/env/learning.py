@@ -14,6 +14,7 @@ import os
 import signal
 import time
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from ..runtime.arrays import parse_device
 from . import training_files
 from .environment import Env
+from .loggers import checked
 from .runner import Runner, describe_end, load_checkpoint, run
 from .training_log import TrainingLog
 from .validation import check_folder, check_number, check_positive, check_whole
@@ -134,7 +136,9 @@ class CapturedPPO(PPO):
         if torch.device(self.device).type != "cuda" or self.actor.is_recurrent or not self.captures:
             return super().act(obs)
         if self.graph is None:
-            super().act(obs)  # warms up
+            before = torch.cuda.get_rng_state(self.device)
+            super().act(obs)  # warms up, and draws nothing: a training that resumes has the same numbers
+            torch.cuda.set_rng_state(before, self.device)
             self.seen, graph = obs.clone(), torch.cuda.CUDAGraph()
             try:
                 with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # NCCL has threads of its own
@@ -216,7 +220,8 @@ class CapturedPPO(PPO):
         except FloatingPointError as error:
             terms = loss_terms(error)
             bad = [name for name, value in terms.items() if not math.isfinite(value)]
-            return f"loss {', '.join(bad)} not finite" if bad else "the gradient of a finite loss is not finite"
+            others = "the loss of another process" if self.is_multi_gpu else "the gradient of a finite loss"
+            return f"loss {', '.join(bad)} not finite" if bad else f"{others} is not finite"
         finally:
             hook.remove()
             self._keep(back=True)
@@ -260,7 +265,7 @@ def pick_device(asked: str | None) -> str:
 
 def make_runner(
     env: Env, learner: Learner, folder: Path | None = None, save_interval: int = 100, every: int = 10,
-    began: float | None = None, seconds: float = math.inf,
+    began: float | None = None, seconds: float = math.inf, loggers: Sequence[str] = (),
 ) -> Runner:  # fmt: skip
     """Return rsl_rl's runner on an environment, which logs the training in ``folder``; see :func:`train`."""
     for name, value in (("save_interval", save_interval), ("every", every)):
@@ -269,7 +274,10 @@ def make_runner(
     with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints every layer of both networks
         runner = Runner(env, learner.settings(env, save_interval), str(env.device))
     began = time.time() if began is None else began
-    log = TrainingLog(env, folder, every, began, runner.gpu_global_rank == 0, seconds, runner.end_iteration)
+    log = TrainingLog(
+        env, folder, every, began, runner.gpu_global_rank == 0, seconds, runner.end_iteration, loggers,
+        learner.steps * env.num_envs * runner.gpu_world_size, dataclasses.asdict(learner),
+    )  # fmt: skip
     runner.logger = log  # type: ignore[assignment]
     return runner
 
@@ -277,6 +285,7 @@ def make_runner(
 def prepare(
     env: Env, learner: Learner, folder: str | Path, iterations: int | None = None, resume: str | Path | None = None,
     seed: int = 0, save_interval: int = 100, every: int = 10, began: float | None = None, seconds: float = math.inf,
+    loggers: Sequence[str] | None = (),
 ) -> tuple[Runner, int]:  # fmt: skip
     """Return a runner that is ready to train, and how many iterations are left; see :func:`train`."""
     check_folder(folder, resume)
@@ -286,7 +295,7 @@ def prepare(
     folder = Path(folder)
     if str(resume) == training_files.LATEST:
         resume = training_files.newest(folder)  # None: a training that begins
-    runner = make_runner(env, learner, folder, save_interval, every, began, seconds)
+    runner = make_runner(env, learner, folder, save_interval, every, began, seconds, checked(loggers))
     first = load_checkpoint(runner, resume) + 1 if resume is not None else 0
     runner.logger.first = first  # type: ignore[attr-defined]
     total = learner.iterations if iterations is None else iterations
@@ -301,6 +310,7 @@ def prepare(
 def train(
     env: Env, learner: Learner, folder: str | Path, iterations: int | None = None, resume: str | Path | None = None,
     seed: int = 0, save_interval: int = 100, every: int = 10, began: float | None = None, seconds: float = math.inf,
+    loggers: Sequence[str] | None = (),
 ) -> Runner:  # fmt: skip
     """Train, and leave checkpoints ``model_N.pt``, ``last.pt`` with the worlds, and ``progress.jsonl`` in a folder.
 
@@ -321,6 +331,7 @@ def train(
         every: iterations from one printed line to the next.
         began: time from which seconds count, as of ``time.time``.
         seconds: after which no iteration starts, in any of the processes.
+        loggers: beside the rows of the folder: "tensorboard", "wandb"; None: TensorBoard where it is installed.
 
     Raises:
         ValueError: the folder holds another training, the checkpoint is not of this task, or nothing is left to do; or
@@ -328,7 +339,9 @@ def train(
         OSError: there is no such checkpoint, or the folder cannot be made.
         FloatingPointError: learning made a policy that is not finite; the last one before is kept as a checkpoint.
     """
-    runner, left = prepare(env, learner, folder, iterations, resume, seed, save_interval, every, began, seconds)
+    runner, left = prepare(
+        env, learner, folder, iterations, resume, seed, save_interval, every, began, seconds, loggers
+    )
     ending = run(runner, left)
     if ending.fault:
         raise FloatingPointError(f"train: {describe_end(ending)}")

@@ -239,8 +239,10 @@ def run(runner: Runner, iterations: int) -> Ending:
             fault = f"iteration {runner.finished + 1}: {error}"
             if runner.finished >= 0:
                 runner.save_all(runner.finished, worlds=False)  # whose course would end in the same way
-    runner.logger.flush()  # type: ignore[attr-defined]
-    unwritten = runner.unwritten | runner.logger.unwritten  # type: ignore[attr-defined]
+    log: Any = runner.logger
+    log.flush()
+    log.close()
+    unwritten = runner.unwritten | log.unwritten | log.lost
     lost = tuple(f"{name} ({why})" for name, why in unwritten.items())
     return Ending(runner.finished, runner.stop.signal, fault, lost)
 

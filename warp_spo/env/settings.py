@@ -74,6 +74,9 @@ def gather(folder: Path | None, task: str, file: Path | None, texts: Sequence[st
     run = found.get("run", {})
     if not isinstance(run, Mapping) or run.get("task") != task:
         run, found = {}, {}
+    for name in ("worlds", "processes", "iterations", "seed", "save_interval"):
+        if as_integer(run.get(name, 1)) is None:
+            raise ValueError(f"{str(folder)!r}: {FILE} has run.{name} = {run[name]!r}; expected an integer")
     own = read(file) if file is not None else {}
     return dict(run), {n: x for n, x in merge(merge(found, own), parse(texts)).items() if n not in ABOUT}
 

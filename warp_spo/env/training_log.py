@@ -7,13 +7,14 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from ..errors import shown
+from . import loggers
 from .compile.guard import BEYOND, NOT_FINITE
 from .training_files import write_bytes
 
@@ -32,7 +33,8 @@ class TrainingLog:
 
     def __init__(
         self, env: Env, folder: Path | None, every: int, began: float, writes: bool, seconds: float = math.inf,
-        after: Callable[[int, int], None] | None = None,
+        after: Callable[[int, int], None] | None = None, others: Sequence[str] = (), frames: int = 0,
+        config: Mapping[str, Any] | None = None,
     ):  # fmt: skip
         self.env, self.log_dir, self.every, self.began = env, folder and str(folder), every, began
         self.ends, self.after = began + seconds, after
@@ -43,6 +45,9 @@ class TrainingLog:
         self.git_status_repos: list[str] = []
         self.file: Path | None = None
         self.unwritten: dict[str, str] = {}
+        self.lost: dict[str, str] = {}  # loggers that have failed, and why
+        self._others, self.frames, self._config = list(others), frames, config or {}
+        self._open: dict[str, Any] = {}  # loggers
         self._size, self._waiting = 0, b""  # bytes of the file that are whole, and those that it still lacks
 
     def init_logging_writer(self) -> None:
@@ -58,6 +63,7 @@ class TrainingLog:
         if self.rows:
             self.began -= self.rows[-1]["seconds"]
         self.file = file
+        self._open = {name: loggers.start(name, file.parent, self.first, self._config) for name in self._others}
 
     def process_env_step(self, *_: Any) -> None:
         """Do nothing."""
@@ -90,6 +96,7 @@ class TrainingLog:
         row["reward"] = sum(value for name, value in row.items() if name.startswith("/reward/"))
         self.rows.append(row)
         self._append(lines_of([row]))
+        self._log_elsewhere(row, it)
         if it % self.every == 0 or it + 1 == total_it:
             reward = f"{row['reward']:8.3f}" if row["/episode/finished"] else f"{'-':>8}"
             length = f"{row['/episode/seconds']:5.1f}" if row["/episode/whole"] else f"{'-':>5}"
@@ -97,6 +104,26 @@ class TrainingLog:
                   f"episode {length} s  collecting {1e3 * collect_time:4.0f} ms  "
                   f"learning {1e3 * learn_time:4.0f} ms", flush=True)  # fmt: skip
             self._print_faults(row)
+
+    def _log_elsewhere(self, row: dict[str, float], iteration: int) -> None:
+        """Write an iteration to TensorBoard and others; one that fails is a warning, and is left from then on."""
+        found = loggers.tags(row, self.env, self.frames) if self._open else {}
+        for name, logger in list(self._open.items()):
+            try:
+                logger.log(found, iteration, time.time())
+            except Exception as error:  # of another library: the training goes on
+                del self._open[name]
+                self.lost[name] = f"from iteration {iteration} on: {error}"
+                warnings.warn(f"train: logger {name} has failed ({error}); the training goes on without", stacklevel=2)
+
+    def close(self) -> None:
+        """End other loggers."""
+        for name, logger in self._open.items():
+            try:
+                logger.close()
+            except Exception as error:  # of another library
+                self.lost[name] = f"at the end: {error}"
+        self._open = {}
 
     def _append(self, text: bytes) -> None:
         """Write lines behind those of the file that are whole; what a full disk leaves out is tried again later."""
