@@ -18,6 +18,7 @@ from warp_spo.trace.evaluation import evaluate
 H, WORLDS = 5e-3, 3
 SMOOTH = 2e-4  # of rates at 2 rad/s after 5 ms [rad/s, m/s]; 3e-5 measured, three passes are off by 3e-3
 SECOND_ORDER = 6.0  # by which half a step is better, of errors of third order; 7.9 measured
+RISE = 2e-4  # of energy in 1 s of flight at 3 rad/s; 1.1e-4 measured
 ROUNDING = 1e-12  # of the largest entry; 1e-14 measured
 
 
@@ -86,6 +87,49 @@ def test_a_planted_bug_is_seen(bug, monkeypatch):
     with pytest.raises(AssertionError):
         test_rates_are_of_second_order()
         test_what_a_light_base_carries_turns_as_it_should(1000.0)
+
+
+def test_one_round_keeps_the_energy_of_a_tree_in_flight():
+    """Velocity terms at the start of the step give it energy in every step; with one round only of third order."""
+    scene = links(1.0).with_values(gravity=np.zeros(3))
+    dyn, a = spo.Dynamics(scene, WORLDS, "cpu", "float64", granularity="tree"), flying(scene, 3.0)
+    start, rises = dyn.kinetic_energy(a["q"], a["qd"]), {}
+    for rounds in (0, 1):
+        q, qd, rises[rounds] = a["q"], a["qd"], 0.0
+        for _ in range(200):
+            q, qd = dyn.step(q, qd, None, H, options=spo.StepOptions(rounds=rounds))
+            rises[rounds] = max(rises[rounds], (dyn.kinetic_energy(q, qd) / start - 1.0).max())
+    assert rises[1] <= RISE < 0.1 * rises[0]
+
+
+def test_rounds_that_a_step_cannot_make_are_refused():
+    scene = links(1.0)
+    dyn, a = spo.Dynamics(scene, WORLDS, "cpu", "float64"), flying(scene)
+    for rounds in (-1, 1.5):
+        with pytest.raises(ValueError, match=f"rounds is {rounds}; expected an integer, 0 or more"):
+            dyn.step(a["q"], a["qd"], None, H, options=spo.StepOptions(rounds=rounds))
+    dyn = spo.Dynamics(scene.with_contacts([]), WORLDS, "cpu", "float64")
+    with pytest.raises(ValueError, match="rounds is given, and the scene has no contacts"):
+        dyn.step(a["q"], a["qd"], None, H, options=spo.StepOptions(rounds=1))
+
+
+@pytest.mark.slow
+def test_gradients_of_one_round_are_differences(device):
+    torch = pytest.importorskip("torch")
+    scene, kind = links(10.0), dict(dtype=torch.float64, device=str(device).replace("cuda:0", "cuda"))
+    dyn, a = spo.Dynamics(scene, WORLDS, device, "float64"), flying(scene)
+    q, qd = (torch.tensor(a[name], **kind) for name in ("q", "qd"))
+
+    def end(qd):
+        return sum((x**2).sum() for x in dyn.step(q, qd, None, H, options=spo.StepOptions(rounds=1)))
+
+    given = qd.clone().requires_grad_()
+    end(given).backward()
+    for dof in range(scene.dof_count):
+        nudge = torch.zeros_like(qd)
+        nudge[:, dof] = 1e-5
+        wanted = (end(qd + nudge) - end(qd - nudge)) / 2e-5
+        assert abs(given.grad[:, dof].sum() - wanted) <= 1e-7 * abs(given.grad).max()
 
 
 @pytest.mark.slow

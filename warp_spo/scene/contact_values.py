@@ -53,8 +53,8 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
             k = chosen_stiffness(load / (rests * sinks[point.body]), mass)
         d = contact.damping if contact.dissipation is None else contact.dissipation
         d = DAMPING_TIME * k if d is None else d
-        mine = contact.friction, k, d, contact.torsional_friction, contact.rolling_friction
-        for name, value in zip(CONTACT_VALUES, mine, strict=True):
+        numbers = contact.friction, k, d, contact.torsional_friction, contact.rolling_friction
+        for name, value in zip(CONTACT_VALUES, numbers, strict=True):
             values[name][0, i] = value
     warn_of_soft_contacts("Scene", scene, stand)
     return {name: read_only(value) for name, value in values.items()}

@@ -74,19 +74,20 @@ def launch(
     more: dict[str, wp.array],
     wrt: tuple[str, ...],
     passes: int | None = None,
+    rounds: int | None = None,
     **given: Any,
 ) -> None:
     """Launch the gradients of a step, into ``out`` by the first name of ``wrt`` and into ``more`` by the others.
 
     Args:
-        passes: as of the step. given: arrays and numbers by name: arguments of the step, "qdd" that it found, and the
-            cotangents of its results.
+        passes, rounds: as of the step. given: arrays and numbers by name: arguments of the step, "qdd" that it found,
+            and the cotangents of its results.
     """
     count = PASSES if passes is None else passes
     given = {name: value for name, value in given.items() if value is not None}
     results = dict(zip(wrt, (out, *more.values()), strict=True))
-    if midpoint_contact.uses_midpoint(dyn.scene, count):
-        midpoint_contact_gradients.backpropagate(dyn, functools.partial(_launch, dyn), results, count, **given)
+    if made := midpoint_contact.count_rounds(dyn.scene, count, rounds):
+        midpoint_contact_gradients.backpropagate(dyn, functools.partial(_launch, dyn), results, count, made, **given)
     else:
         _launch(dyn, results, count, **given)
 

@@ -88,6 +88,7 @@ def semi_implicit(
     bodies: tuple[wp.array, wp.array] | None = None,
     reports: dict[str, wp.array] | None = None,
     passes: int | None = None,
+    rounds: int | None = None,
     substeps: int = 1,
     **given: Any,
 ) -> None:
@@ -95,7 +96,7 @@ def semi_implicit(
 
     Args:
         qdd, status: arrays to fill, see :meth:`Dynamics.step`; reports: others, by name. bodies: arrays for poses and
-            velocities of the bodies after the step. passes: of scenes with contacts.
+            velocities of the bodies after the step. passes, rounds: of scenes with contacts.
         substeps: more than one only where :func:`several_launches` names no reason against it.
         given: forces and targets by name. With ``q_from``, ``qd_from`` the step starts from that state, while its sweep
             and the laws of its joints are evaluated at q, qd.
@@ -110,8 +111,8 @@ def semi_implicit(
     if dyn.scene.contacts:
         count = float(pairs.default_passes(dyn.scene) if passes is None else passes)
         given |= {"passes": count, "reports": tuple(reports or ()), **option}
-        if midpoint_contact.uses_midpoint(dyn.scene, count):
-            midpoint_contact.step(dyn, dt, (q_out, qd_out), more | (reports or {}), q, qd, **given)
+        if made := midpoint_contact.count_rounds(dyn.scene, count, rounds):
+            midpoint_contact.step(dyn, dt, (q_out, qd_out), more | (reports or {}), q, qd, made, **given)
         else:
             launch(contact_routine(dyn), qd_out, more | (reports or {}), qd=qd, dt=dt, q=q, **given)
     elif not dyn.closed:
@@ -156,11 +157,18 @@ def _walks(dyn: Dynamics) -> bool:
     return dyn.plan.of(STEP) == "segment" and dyn.programs.builder.supports_body_kinematics
 
 
-def several_launches(dyn: Dynamics, integrator: str, acts: bool, delays: bool, passes: int | None = None) -> str:
+def several_launches(
+    dyn: Dynamics,
+    integrator: str,
+    acts: bool,
+    delays: bool,
+    passes: int | None = None,
+    rounds: int | None = None,
+) -> str:
     """Return why substeps take a launch each; "" if one kernel takes all of them.
 
     Args:
-        acts: controls are given. delays: some are delayed. passes: of a step with contacts.
+        acts: controls are given. delays: some are delayed. passes, rounds: of a step with contacts.
     """
     if integrator != "semi_implicit":
         return f"integrator={integrator!r} takes several"
@@ -168,8 +176,9 @@ def several_launches(dyn: Dynamics, integrator: str, acts: bool, delays: bool, p
         return "loops='multipliers' takes several"
     if dyn.scene.contact_pairs:
         return "bodies that touch each other take one for each"
-    if passes is not None and midpoint_contact.uses_midpoint(dyn.scene, passes):
-        return f"{passes} passes take iterations of the midpoint scheme"
+    if passes is not None and midpoint_contact.count_rounds(dyn.scene, passes, rounds):
+        asked = f"{passes} passes" if rounds is None else f"rounds={rounds}"
+        return f"{asked} take{'s' if rounds else ''} iterations of the midpoint scheme"
     if delays:
         return "delays of actuators count substeps"
     tendons = acts and any(len(actuator.hinges) > 1 for actuator in dyn.scene.actuators)

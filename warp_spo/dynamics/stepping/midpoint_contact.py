@@ -1,8 +1,8 @@
 """The midpoint scheme of steps with contacts: velocity terms act as two half-step impulses.
 
-Steps of MIDPOINT_PASSES passes and more use it. Each iteration evaluates the velocity terms at the midpoint of the
-previous iteration's step and repeats the step with them. ITERATIONS iterations are made, of all passes each. Then
-velocity terms are evaluated at the midpoint of the last one's step, see
+Steps of MIDPOINT_PASSES passes and more use it, and others that ask for rounds. Each round evaluates the velocity terms
+at the midpoint of the previous round's step and repeats the step with them. Each makes all passes. Then velocity terms
+are evaluated at the midpoint of the last one's step, see
 :mod:`warp_spo.recursions.contact.velocity_kicks`.
 """
 
@@ -79,9 +79,15 @@ class MidpointIteration(NamedTuple):
         return {"q": self.q, START: q, KICK: self.kick, PATH: self.path}
 
 
-def uses_midpoint(scene: Scene, passes: float) -> bool:
-    """Return whether a step of so many passes uses the midpoint scheme; one with pairs of bodies does not."""
-    return passes >= MIDPOINT_PASSES and not scene.contact_pairs
+def count_rounds(scene: Scene, passes: float, rounds: int | None) -> int:
+    """Return how many rounds of so many passes a step of the midpoint scheme makes; 0 where it is another step.
+
+    Args:
+        rounds: as the caller gives it. None: ITERATIONS from MIDPOINT_PASSES passes on, unless pairs of bodies touch.
+    """
+    if rounds is not None:
+        return rounds
+    return ITERATIONS if passes >= MIDPOINT_PASSES and not scene.contact_pairs else 0
 
 
 def step(
@@ -91,9 +97,10 @@ def step(
     more: dict[str, wp.array],
     q: wp.array,
     qd: wp.array,
+    rounds: int,
     **given: Any,
 ) -> None:
-    """Launch a step of the midpoint scheme.
+    """Launch a step of the midpoint scheme, of so many ``rounds``.
 
     Args:
         ends: arrays for q and qd after it. more: further arrays to fill, by name. given: arguments of the step, with
@@ -106,7 +113,7 @@ def step(
     )
     options: dict[str, Any] = {name: given.pop(name) for name in ("qdd", "status") if name in given}
     further = {"qdd_out": more["qdd_out"]} if "qdd" in options else {}
-    last = run(dyn, dt, q, qd, given, more | {"q_out": q_out}, options)[-1]
+    last = run(dyn, dt, q, qd, rounds, given, more | {"q_out": q_out}, options)[-1]
     state: dict[str, Any] = {"q": q, "qd": qd, "dt": dt, PREVIOUS_RATES: last.found, PREVIOUS_KICK: last.kick}
     state |= {PASS_ACCELERATION: last.gained, "qdd": True} if further else {}
     dyn._engine.launch_routine(FINAL_KICK, qd_out, further, **state)
@@ -125,12 +132,13 @@ def run(
     dt: float,
     q: wp.array,
     qd: wp.array,
+    rounds: int,
     given: dict[str, Any],
     more: dict[str, wp.array],
     options: dict[str, Any],
     gains: bool = False,
 ) -> list[MidpointIteration]:
-    """Launch the iterations of a step without the final kick, and return them.
+    """Launch the iterations of a step of so many ``rounds`` without the final kick, and return them.
 
     Args:
         given: arguments of the step. more: arrays that the last iteration fills, by name, for these ``options``.
@@ -138,12 +146,12 @@ def run(
     """
     iterations, launch = list[MidpointIteration](), dyn._engine.launch_routine
     given, reports = given | {"reports": ()}, given["reports"]
-    while len(iterations) < ITERATIONS:
+    while len(iterations) < rounds:
         one = begin_iteration(dyn, dt, q, qd, iterations)
         iterations.append(one)
         asked = {"q_out": dyn.recursions.array("q of a round", *q.shape)}
         chosen = {"qdd": True} if gains else {}
-        if len(iterations) == ITERATIONS:
+        if len(iterations) == rounds:
             asked, given, chosen = asked | more, given | {"reports": reports}, chosen | options
         asked |= {"qdd_out": one.gained} if "qdd" in chosen else {}
         launch(CONTACT_STEP, one.found, asked, qd=qd, dt=dt, **one.step(q), **given, **chosen)

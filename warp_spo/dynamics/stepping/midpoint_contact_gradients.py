@@ -24,6 +24,7 @@ def backpropagate(
     back: Callable[..., None],
     results: dict[str, wp.array],
     passes: int,
+    rounds: int,
     q_cotangent: wp.array,
     qd_cotangent: wp.array,
     **given: Any,
@@ -32,12 +33,12 @@ def backpropagate(
 
     Args:
         back: ``back(results, passes, **given)`` launches those of passes between kicks.
-        results: arrays to fill, by name of what they are gradients by. passes: of an iteration. given: arguments of the
-            step, and "qdd" that it found, which is found anew.
+        results: arrays to fill, by name of what they are gradients by. passes: of an iteration. rounds: how many
+            iterations. given: arguments of the step, and "qdd" that it found, which is found anew.
     """
     q, qd, dt, _ = (given.pop(name) for name in ("q", "qd", "dt", "qdd"))
     iterations = midpoint_contact.run(
-        dyn, dt, q, qd, given | {"passes": float(passes), "reports": ()}, {}, {}, gains=True
+        dyn, dt, q, qd, rounds, given | {"passes": float(passes), "reports": ()}, {}, {}, gains=True
     )
     end = midpoint_contact.begin_iteration(dyn, dt, q, qd, iterations)
     for array in results.values():

@@ -67,7 +67,7 @@ def _pull_step(
             arrays[name] = call.read(name, array, shape[like])
         names, outs = gradients.outs(call, operation, arrays, wrt, None)
         if dyn.scene.contacts:
-            arrays["passes"] = options.get("passes")
+            arrays |= {name: options.get(name) for name in ("passes", "rounds")}
         gradients.launch(derivative, names, outs, arrays)
     return by_name(names, call.result)
 
@@ -134,6 +134,7 @@ STEP = Operation(
         Option("actuator_state", asked=False, stand_in=actuators.stand_in),
         Option("substeps", default=lambda scene: 1),
         Option("passes", default=lambda scene: None),
+        Option("rounds", default=lambda scene: None),
         *REPORTS,
     ),
     bundles=(OPTIONS, REPORT),
@@ -174,6 +175,7 @@ def _step(
     actuator_state: actuators.ActuatorState | None = None,
     substeps: int = 1,
     passes: int | None = None,
+    rounds: int | None = None,
     qdd: AnyArray | None = None,
     poses: AnyArray | None = None,
     velocities: AnyArray | None = None,
@@ -203,7 +205,8 @@ def _step(
         buffers = actuators.read_state(self, call, actuator_state)
         states = _read_if_given(self, call, {"poses": poses, "velocities": velocities})
         reports = _read_if_given(self, call, asked)
-        given |= {} if taken is None else {"passes": taken, "reports": reports}
+        made = contact_options.check_rounds(self, call, rounds)
+        given |= {} if taken is None else {"passes": taken, "rounds": made, "reports": reports}
         given["bodies"] = integrators.arrays_of_bodies(self, states) if states else None
         q_out, qd_out = engine.write(call, STEP, outs, given)
         interval = StepArrays(given["q"], given["qd"], q_out, qd_out, given["dt"])
@@ -318,7 +321,8 @@ def _launch(
     ctrl, status, bodies = given.pop("ctrl"), given.get("status"), given.pop("bodies")
     # Only the semi-implicit integrator fills the states of bodies itself, in the last substep.
     of_last = {"bodies": bodies} if integrator == "semi_implicit" else {}
-    obstacle = integrators.several_launches(dyn, integrator, ctrl is not None, buffers is not None, given.get("passes"))
+    taken = given.get("passes"), given.get("rounds")
+    obstacle = integrators.several_launches(dyn, integrator, ctrl is not None, buffers is not None, *taken)
     ctrl = ctrl if dyn.scene.actuators else None
     if 1 < count <= MOST_FUSED and not obstacle:
         INTEGRATORS[integrator](dyn, call, interval, **given, **of_last, ctrl=ctrl, substeps=count)

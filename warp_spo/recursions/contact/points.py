@@ -232,7 +232,7 @@ def place_points(
                 damping = select(deep, slow, damping)
             material = k, damping, mu, eps, weight
             push = k * below if half_way else k * below - damping * faster
-            state = turned, below, push, cell, near if branches else None, lever, turning, deep
+            state: Any = (turned, below, push, cell, near if branches else None, lever, turning, deep)
             found.append(TracedContactPoint(number, on, arm, inward, -depth, mine.twist, *material, *state))
     return found
 
