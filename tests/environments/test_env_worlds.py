@@ -409,6 +409,8 @@ def test_a_loaded_log_leaves_out_what_the_saved_one_does():
     (events.randomise("joint_X_p", (-0.1, 0.1), "add"), "joint_X_p of joint base .* expected unit quaternions"),
     (events.Values(("body_mass",), lambda w: w.values["body_mass"].__setitem__(1, -1.0)),
      "an event draws body_mass.1. as -1 in world 0"),
+    (events.randomise("joint_limit_lower", (2e10, 3e10), "set", names="joint_1"),
+     "an event draws joint_limit_lower of dof joint_1 as .*, above joint_limit_upper 1e.10, in world 0"),
 ])  # fmt: skip
 def test_impossible_draws_are_refused_with_their_range(event, words):
     with pytest.raises(ValueError, match=words):

@@ -16,6 +16,7 @@ from .validation import Range
 
 SMALLEST = 1e-12  # share of a body's largest moment of inertia that is rounding
 WHOLE = ("gravity", "ground_origin", "ground_field")  # values of the world, which have no entries
+LIMITS = ("joint_limit_lower", "joint_limit_upper")
 POSES = ("joint_X_p", "joint_X_c")
 QUATERNION = slice(3, 7)  # of a pose's numbers
 
@@ -55,8 +56,17 @@ def check_draws(scene: Scene, name: str, entries: Sequence[int], spans: Sequence
 
 def check_drawn(scene: Scene, values: Mapping[str, Any]) -> None:
     """Raise ValueError if what events have drawn [world, ...], by name, holds what a value cannot be."""
-    for name, drawn in values.items():
-        found = drawn.double().cpu().numpy()
+    every = {name: drawn.double().cpu().numpy() for name, drawn in values.items()}
+    if every.keys() & {*LIMITS}:
+        low, high = np.broadcast_arrays(*(np.float32(every.get(name, scene.values[name])) for name in LIMITS))
+        if (low > high).any():
+            world, dof = (int(i) for i in np.argwhere(low > high)[0])
+            label, ends = shown(scene.dof_labels[dof]), (low[world, dof], high[world, dof])
+            raise ValueError(
+                f"Env: an event draws joint_limit_lower of dof {label} as {ends[0]:g}, above joint_limit_upper "
+                f"{ends[1]:g}, in world {world}; expected ranges in which lower is below upper"
+            )
+    for name, found in every.items():
         own = scene.values[name][0]
         wrong = ~np.isfinite(found) if name not in RANGES else np.isnan(found)
         wrong |= (found < 0.0) & (name in NOT_NEGATIVE)
