@@ -65,7 +65,7 @@ def pictures(
 class FilmProgress:
     """The progress of a film, on stderr: what a picture costs here, as measured, and how long the others will take.
 
-    The first picture, which loads kernels, does not count. A film that is done sooner than LONGEST_SILENCE says nothing.
+    The first picture, which loads kernels, does not count. A film that is done within LONGEST_SILENCE says nothing.
 
     Args:
         count: of pictures. clock: returns the time [s].
