@@ -254,7 +254,7 @@ def test_a_large_field_is_coarse_far_away_alone():
 def test_a_film_says_how_far_it_is(capsys):
     """Its seconds are those measured from the second picture on; a short film says nothing."""
     times = iter(np.concatenate([[50.0], 50.0 + 0.5 * np.arange(1, 100)]))
-    progress = films.Progress(60, lambda: next(times))
+    progress = films.FilmProgress(60, lambda: next(times))
     for done in range(1, 61):
         progress.show(done)
     lines = capsys.readouterr().err.splitlines()
@@ -262,7 +262,7 @@ def test_a_film_says_how_far_it_is(capsys):
         "picture 2 of 60: 0.50 s each, 29 s left", "picture 23 of 60: 0.50 s each, 18 s left",
         "picture 44 of 60: 0.50 s each, 8 s left",
     ]  # fmt: skip
-    short = films.Progress(9, iter(np.arange(0.0, 5.0, 0.5)).__next__)
+    short = films.FilmProgress(9, iter(np.arange(0.0, 5.0, 0.5)).__next__)
     for done in range(1, 10):
         short.show(done)
     assert not capsys.readouterr().err

@@ -15,7 +15,7 @@ from ..scene.scene import Scene
 from .renderer import Camera, Renderer
 from .shapes import Primitive, size_of
 
-PATIENCE, PERIOD = 5.0, 10.0  # a film says how far it is if it takes longer than this, and as often as this [s]
+LONGEST_SILENCE, PERIOD = 5.0, 10.0  # a film says how far it is if it takes longer than this, and as often as this [s]
 STEADY = 0.25  # a camera that follows keeps its height where the robot's changes less, over the camera's distance
 
 
@@ -52,7 +52,7 @@ def pictures(
         looked[:, 2] = looked[:, 2].mean()
     beside = list(dict.fromkeys(marker for some in markers for marker in some))
     renderer = Renderer(shapes, scene.body_count, scene.ground, camera, beside, device, looked)
-    found, progress = [], Progress(len(q))
+    found, progress = [], FilmProgress(len(q))
     for i in range(len(q)):
         picture = Image.fromarray(renderer.draw(poses[i], looked[i], markers[i] if len(markers) else ()))
         if len(captions):
@@ -62,10 +62,10 @@ def pictures(
     return found
 
 
-class Progress:
+class FilmProgress:
     """The progress of a film, on stderr: what a picture costs here, as measured, and how long the others will take.
 
-    The first picture, which loads kernels, does not count. A film that is done sooner than PATIENCE says nothing.
+    The first picture, which loads kernels, does not count. A film that is done within LONGEST_SILENCE says nothing.
 
     Args:
         count: of pictures. clock: returns the time [s].
@@ -83,7 +83,7 @@ class Progress:
             return
         each = (now - self.began) / (done - 1)
         left = each * (self.count - done)
-        if now - self.told > PERIOD and left > (PATIENCE if self.told == -math.inf else 0.0):
+        if now - self.told > PERIOD and left > (LONGEST_SILENCE if self.told == -math.inf else 0.0):
             print(f"picture {done} of {self.count}: {each:.2f} s each, {left:.0f} s left", file=sys.stderr, flush=True)
             self.told = now
 
