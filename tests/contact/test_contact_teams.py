@@ -11,7 +11,7 @@ import warp_spo as spo
 from support import symbolic, warp_machine, zoo
 from support.actuated import driven_hand
 from support.contact_cases import box, everywhere, quadruped, touching
-from support.contact_steps import FIELDS, above, assert_is_dense, steps
+from support.contact_steps import FIELDS, above, assert_is_dense, steps, with_turning
 from support.step_scenes import furnished, states
 from warp_spo.dynamics.stepping.integrators import CONTACT_STEP
 from warp_spo.execution import plan
@@ -24,7 +24,7 @@ from warp_spo.recursions.model.exchange import SegmentExchange
 from warp_spo.reference.contact import ContactStep
 
 H, WORLDS = 5e-3, 4
-SIZES = {"contact_f": (3,), "contact_gap": (), "contact_slip": ()}
+SIZES = {"contact_f": (3,), "contact_gap": (), "contact_slip": (), "contact_moment": (3,)}
 
 
 def case(name):
@@ -33,8 +33,8 @@ def case(name):
     if name in ("quadruped", "stairs"):
         scene = quadruped(ground=steps() if name == "stairs" else None)
         return scene, dict(zip(("q", "qd", "tau"), touching(scene, 3, WORLDS), strict=True))
-    if name == "crowded":
-        scene = mirrored()
+    if name in ("crowded", "turning"):
+        scene = mirrored() if name == "crowded" else with_turning(mirrored())
         return scene, dict(zip(("q", "qd", "tau"), touching(scene, 3, WORLDS), strict=True))
     if name == "driven":
         scene = everywhere(driven_hand(), 0)
@@ -95,6 +95,7 @@ def assert_alike(got, more, wanted):
         ("quadruped", True),
         ("fork", False),
         ("crowded", True),
+        pytest.param("turning", True, marks=pytest.mark.slow),
         pytest.param("tree", True, marks=pytest.mark.slow),
         pytest.param("driven", True, marks=pytest.mark.slow),
         pytest.param("stairs", False, marks=pytest.mark.slow),
