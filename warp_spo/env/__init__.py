@@ -120,7 +120,8 @@ def make(name: str, worlds: int | None = None, device: Any = None, seed: int = 0
     """Return the environment of a task; nothing is downloaded.
 
     Args:
-        name: "cartpole", "ant", "panda-reach", "go2-flat", "go2-rough" or "g1-flat".
+        name: "cartpole", "ant", "panda-reach", "go2-flat", "go2-rough" or "g1-flat"; or of a task of your own: FILE.py,
+            package.module, or a name that a package registers ("python -m warp_spo.tasks" lists them).
         worlds: how many; None: as many as the task is trained with.
         device: Warp or torch device. seed: of all random numbers. options: arguments of ``Env`` that the task leaves
             open, such as ``first_world`` and ``final_observations``.
