@@ -94,7 +94,8 @@ def pair_values(pair: ContactPair, scene: Any, neutral: NeutralPose) -> tuple[fl
 
 def _pressing(pair: ContactPair, scene: Any) -> float:
     """Return the sum of the effort limits of prismatic joints between the bodies of a pair [N]."""
-    ways, most = [], scene.values["joint_effort_limit"][0]
+    ways: list[set[int]] = []
+    most = scene.values["joint_effort_limit"][0]
     for body in (pair.body, pair.other):
         ways.append(set())
         while body >= 0:
