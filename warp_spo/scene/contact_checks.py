@@ -45,7 +45,7 @@ def warn_of_soft_contacts(call: str, scene: Any, neutral: NeutralPose) -> None:
     It sinks under the weight of its tree and of the trees that pairs connect with it, on the points that it has at
     rest; in a pair under the weight of the lighter tree.
     """
-    found: list[tuple[Any, int, Any, float]] = []
+    found: list[tuple[int, int, float, float]] = []
     points = scene.contact_points
     of_tree = neutral.roots[[point.body for point in points]] if points else np.zeros(0)
     for row, index in enumerate(one.contact for one in (*points, *scene.contact_pairs)):
