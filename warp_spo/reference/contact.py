@@ -322,7 +322,8 @@ class ContactStep:
             moves = share * self.h * dense.jacobian([(point.body, (*seat, 0, 0, 0, 1))])[0, :3] @ path
             centre, rolls = at, point.radius > 0.0 and not plane and point.support is None
             at = at if rolls else at - point.radius * up
-            there = self.neutral.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0, :3]
+            typical = point.place((0.0, 0.0, 1.0))
+            there = self.neutral.jacobian([(point.body, (*typical, 0, 0, 0, 1))])[0, :3]
             weight = SLIP * np.trace(there @ inverse @ there.T) / 3.0
             k, d, mu = (dense.value(f"contact_{name}")[number] for name in ("stiffness", "damping", "friction"))
             if plane:
