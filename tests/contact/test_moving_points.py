@@ -1,4 +1,4 @@
-"""Cylinders, cones and ellipsoids: points that move over them, beside supports, differences, the dense step; wheels."""
+"""Boxes and round shapes: points that move over them, beside supports, differences, the dense step; wheels."""
 
 import numpy as np
 import pytest
@@ -49,6 +49,22 @@ def test_the_lowest_point_is_that_of_the_shape(kind):
         places = np.array([point.place(normal) for point in contact])
         assert abs((places @ normal).min() - (cloud @ normal).min()) < 2e-6
         assert max(np.linalg.norm(cloud - place, axis=1).min() for place in places) < 2e-3  # between samples
+
+
+def test_a_box_has_the_corners_of_the_face_that_looks_down():
+    """Of all eight the lowest are among them, in 50 directions; and those of one face, along the normal's largest
+    part."""
+    scene = box().with_contacts([spo.Contact(0, box=((0.1, 0.06, 0.03), POSE))], spo.Plane())
+    corners, turn = scene.contacts[0].positions, pose_matrix(np.array(POSE))[:3, :3]
+    assert len(corners) == 8 and len(scene.contact_points) == 4
+    assert len(scene.with_contacts(scene.contacts, FIELDS["rough"]).contact_points) == 8
+    for normal in np.random.default_rng(0).normal(size=(50, 3)):
+        normal /= np.linalg.norm(normal)
+        places = np.array([point.place(normal) for point in scene.contact_points])
+        assert abs((places @ normal).min() - (corners @ normal).min()) < 1e-12
+        along = (places - POSE[:3]) @ turn
+        face = np.abs(normal @ turn).argmax()
+        assert np.ptp(along[:, face]) < 1e-12 and len(np.unique(np.round(along, 9), axis=0)) == 4
 
 
 @pytest.mark.parametrize("kind", ROUND)

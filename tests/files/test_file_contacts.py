@@ -143,7 +143,7 @@ def test_patterns_choose_shapes():
     assert labels(contacts="SHIN") == ["rod", "toe"]
     assert labels(contacts=["toe", "wedge", "l?ns"]) == ["lens", "prism", "toe"]
     scene = quiet(spo.from_mujoco, model, contacts={"can": 6, "prism": 5}, ground=spo.Plane(0.3))
-    assert [len(c.placements) for c in scene.contacts] == [4, 5] and scene.ground.height == 0.3
+    assert [len(c.placements(None)) for c in scene.contacts] == [4, 5] and scene.ground.height == 0.3
 
 
 @pytest.mark.parametrize("options, error, words", [

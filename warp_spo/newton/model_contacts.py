@@ -213,7 +213,7 @@ class ModelContacts(NamedTuple):
             place[shape.index]
             for shape, made in self.selected.contacts_by_shape
             for one in made
-            for _ in one.placements
+            for _ in one.placements(self.selected.ground)
         ]
         return self.shapes.rows[:, columns]
 

@@ -360,7 +360,8 @@ class ContactStep:
             moves = share * self.h * dense.jacobian([(point.body, (*seat, 0, 0, 0, 1))])[0, :3] @ path
             centre, rolls = at, point.radius > 0.0 and not plane and point.support is None
             at = at if rolls else at - point.radius * up
-            there = self.neutral.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0]
+            typical = point.place((0.0, 0.0, 1.0))
+            there = self.neutral.jacobian([(point.body, (*typical, 0, 0, 0, 1))])[0]
             weight, turn_weight = (SLIP * np.trace(part @ inverse @ part.T) / 3.0 for part in (there[:3], there[3:]))
             moves_and_turns = min(weight, turn_weight) > 0.0 and weight / turn_weight > LEAST_LENGTH**2
             length = np.sqrt(weight / turn_weight) if moves_and_turns else LENGTH

@@ -15,7 +15,7 @@ def support_path(support, turn, up, w, change):
     """
     offset = turn @ support.offset(turn.T @ up)
     axes, sizes = np.array(support.axes) @ turn.T, np.array(support.sizes)
-    if support.kind == "face":
+    if support.kind == "corner":
         return offset, 0.0
     if support.kind == "rim":
         hub = axes[2] * (axes[2] @ offset)

@@ -20,7 +20,7 @@ from .frames import pose_matrix
 from .hulls import Hull, convex_hull, grown, is_convex, with_corners
 from .parts import IDENTITY_POSE, checked_pose
 from .pickling import StoredPart
-from .supports import RIM, SURFACE, Support
+from .supports import CORNER, RIM, SURFACE, Support
 
 SWEPT_SEGMENT, BOX, HULL = 0, 1, 2
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])  # of a cube
@@ -164,10 +164,10 @@ class ContactShape(StoredPart):
         """Return the points that touch the ground in the body frame [point, 3] [m], and the radius about each [m]."""
         raise NotImplementedError
 
-    def supports(self) -> tuple[np.ndarray, float, list[Support]]:
+    def supports(self, on_field: bool = False) -> tuple[np.ndarray, float, list[Support]]:
         """Return the middle of a shape whose points move over it (3,) [m], the radius about each, and these points.
 
-        None: the points stay where they are in the body.
+        None: the points stay where they are in the body. ``on_field``: on a height field, not a plane.
         """
         return np.zeros(3), 0.0, []
 
@@ -347,6 +347,11 @@ class BoxShape(ContactShape):
     def arguments(self) -> dict[str, Any]:
         return {"box": (self.half, self.pose)}
 
+    def supports(self, on_field: bool = False) -> tuple[np.ndarray, float, list[Support]]:
+        axes = tuple(map(tuple, pose_matrix(self.pose)[:3, :3].T.tolist()))
+        corners = [] if on_field else [Support(CORNER, axes, tuple(self.half.tolist()), corner) for corner in range(4)]
+        return np.asarray(self.pose)[:3], 0.0, corners
+
     def ground_points(self) -> tuple[np.ndarray, float]:
         return Placement(self.pose).points(CORNERS * self.half), 0.0
 
@@ -416,7 +421,7 @@ class CylinderShape(ContactShape):
         first = np.cross(across, axis) / np.linalg.norm(np.cross(across, axis))
         return np.array([first, np.cross(axis, first), axis]), length
 
-    def supports(self) -> tuple[np.ndarray, float, list[Support]]:
+    def supports(self, on_field: bool = False) -> tuple[np.ndarray, float, list[Support]]:
         (axes, half), (bottom, top) = self._frame(), self.radii
         rows = tuple(map(tuple, axes.tolist()))
         found = [Support(RIM, rows, (top, bottom, half), number) for number in range(max(2, min(4, self.most)))]
@@ -544,7 +549,7 @@ class EllipsoidShape(ContactShape):
     def arguments(self) -> dict[str, Any]:
         return {"ellipsoid": self}
 
-    def supports(self) -> tuple[np.ndarray, float, list[Support]]:
+    def supports(self, on_field: bool = False) -> tuple[np.ndarray, float, list[Support]]:
         axes = tuple(map(tuple, pose_matrix(self.pose)[:3, :3].T.tolist()))
         return np.asarray(self.pose)[:3], self.margin, [Support(SURFACE, axes, tuple(self.half.tolist()), 0)]
 

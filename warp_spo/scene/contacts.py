@@ -77,7 +77,6 @@ class Contact(ShapeArguments):
     shape: ContactShape = dataclasses.field(init=False, repr=False)
     positions: np.ndarray = dataclasses.field(init=False, repr=False)  # on the shape, in the body frame [position, 3]
     radius: float = dataclasses.field(init=False, repr=False)  # of the sphere about each
-    placements: tuple[tuple[Any, Support | None], ...] = dataclasses.field(init=False, repr=False)  # as of ContactPoint
 
     def __post_init__(self) -> None:
         call = f"Contact({quoted(self.label)})" if self.label else "Contact"
@@ -99,11 +98,14 @@ class Contact(ShapeArguments):
         object.__setattr__(self, "shape", shape)
         object.__setattr__(self, "positions", read_only(positions))
         object.__setattr__(self, "radius", radius)
-        middle, _, moving = shape.supports()
-        placements = [(tuple(middle.tolist()), support) for support in moving]
-        object.__setattr__(
-            self, "placements", tuple(placements or ((tuple(place), None) for place in positions.tolist()))
-        )
+
+    def placements(self, ground: Any) -> list[tuple[tuple[float, float, float], Support | None]]:
+        """Return position and support of the points that touch a ground, as :class:`ContactPoint` has them."""
+        middle, _, moving = self.shape.supports(isinstance(ground, HeightField))
+        if not moving or isinstance(ground, Listed):
+            return [((x, y, z), None) for x, y, z in self.positions.tolist()]
+        x, y, z = middle.tolist()
+        return [((x, y, z), support) for support in moving]
 
 
 class ContactPoint(NamedTuple):
@@ -133,7 +135,7 @@ class ContactPoint(NamedTuple):
         return position if self.support is None else position + self.support.offset(normal)
 
 
-def contact_points(contacts: Sequence[Contact]) -> tuple[ContactPoint, ...]:
+def contact_points(contacts: Sequence[Contact], ground: Any) -> tuple[ContactPoint, ...]:
     """Return the points of all contacts with the ground, contact after contact."""
     return tuple(
         ContactPoint(
@@ -149,7 +151,7 @@ def contact_points(contacts: Sequence[Contact]) -> tuple[ContactPoint, ...]:
         )
         for index, contact in enumerate(contacts)
         if contact.other is None
-        for place, support in contact.placements
+        for place, support in contact.placements(ground)
     )
 
 

@@ -380,7 +380,7 @@ class Scene(Stored):
         self.contacts: tuple[Contact, ...] = _parts("contacts", contacts, Contact)
         check_contacts(self.contacts, ground, self.bodies)
         self.ground = Plane() if ground is None and self.contacts else ground
-        self.contact_points: tuple[ContactPoint, ...] = contact_points(self.contacts)
+        self.contact_points: tuple[ContactPoint, ...] = contact_points(self.contacts, self.ground)
         self.contact_pairs: tuple[ContactPair, ...] = contact_pairs(self.contacts, self.bodies)
 
     @property

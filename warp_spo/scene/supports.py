@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-FACE, RIM, SURFACE = "face", "rim", "surface"
+CORNER, RIM, SURFACE = "corner", "rim", "surface"
 """Corners of the face of a box that looks down; points on the rims of a cylinder or a cone; the lowest of an
 ellipsoid."""
 UPRIGHT = 1e-8  # square of the sine below which an axis is along the normal, and points on a rim keep their places
@@ -21,11 +21,11 @@ class Support(NamedTuple):
     """A point that moves over a shape, about the shape's middle.
 
     Attributes:
-        kind: FACE, RIM or SURFACE.
+        kind: CORNER, RIM or SURFACE.
         axes: of the shape, in the body frame [3, 3], one a row.
-        sizes: [m]. FACE: half of the sizes. RIM: radius at the end of the third axis and at the other end, and half
+        sizes: [m]. CORNER: half of the sizes. RIM: radius at the end of the third axis and at the other end, and half
             their distance. SURFACE: half of the axes.
-        number: FACE: 0 to 3. RIM: 0: lowest at the end of the third axis, 1: at the other end, 2 and 3: 120 degrees
+        number: CORNER: 0 to 3. RIM: 0: lowest at the end of the third axis, 1: at the other end, 2 and 3: 120 degrees
             beside the lowest, on the end that is lower, or of a cone on the wider one. SURFACE: 0.
     """
 
@@ -35,10 +35,15 @@ class Support(NamedTuple):
     number: int
 
     @property
+    def signs(self) -> tuple[float, float]:
+        """CORNER: on which side of the face's middle the point is, along the two axes of the face."""
+        return (1.0 if self.number & 1 else -1.0), (1.0 if self.number & 2 else -1.0)
+
+    @property
     def reach(self) -> float:
         """The largest distance from the middle [m]."""
         a, b, c = self.sizes
-        return {FACE: np.hypot(np.hypot(a, b), c), RIM: np.hypot(max(a, b), c), SURFACE: max(a, b, c)}[self.kind]
+        return {CORNER: np.hypot(np.hypot(a, b), c), RIM: np.hypot(max(a, b), c), SURFACE: max(a, b, c)}[self.kind]
 
     def offset(self, normal: Any) -> np.ndarray:
         """Return where the point is from the shape's middle [m]; ``normal`` of the ground and result in the body."""
@@ -69,4 +74,4 @@ def _lowest(n: np.ndarray, half: np.ndarray, number: int) -> np.ndarray:
     return -(half**2) * n / np.linalg.norm(half * n)
 
 
-OFFSETS = {FACE: _corner, RIM: _rim, SURFACE: _lowest}
+OFFSETS = {CORNER: _corner, RIM: _rim, SURFACE: _lowest}

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from ..step.joint_laws import JointLaws
 
 ARMS = 8  # spheres of a segment up to which their arms are kept, see docs/contact_measured.md
+STANDING = (0.0, 0.0, 1.0)  # normal of the ground in a body's frame for which weights of points that move are taken
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
 
 
@@ -303,11 +304,13 @@ def _place_support(trace: Trace, number: int, normal: Vector) -> SupportPlacemen
     turn = trace.links.placements[point.body].matrix @ trace.links.nodes[point.body].anchor[0].T
     axes: list[Value] = [x for axis in point.support.axes for x in turn @ Vector(axis)]
     sizes: list[Value] = list(point.support.sizes)
+    signs: list[Value] = list(point.support.signs)
     if constants is not None:
         if all(map(is_constant, axes)):
             axes = constants.of_point(number, "axes", axes)
         sizes = constants.of_point(number, "sizes", sizes)
-    return place_support(point.support, [Vector(axes[i : i + 3]) for i in (0, 3, 6)], sizes, normal)
+        signs = constants.of_point(number, "signs", signs)
+    return place_support(point.support, [Vector(axes[i : i + 3]) for i in (0, 3, 6)], sizes, signs, normal)
 
 
 def point_links(links: Links) -> list[Link | None]:
@@ -412,5 +415,5 @@ def with_ancestors(links: list[Link | None]) -> set[int]:
 @cached_by_scene
 def inverse_weights(scene: Scene) -> list[float]:
     """Return SLIP times the mean of J Mass^-1 J* over three directions, of each point, neutral, in world 0 [1/kg]."""
-    frames = tuple((point.body, point.position) for point in scene.contact_points)
+    frames = tuple((point.body, tuple(point.place(STANDING).tolist())) for point in scene.contact_points)
     return (SLIP / 3.0 * effective_mass.inverse_weights(scene, frames)).tolist()

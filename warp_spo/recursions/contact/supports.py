@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from ...scene.supports import FACE, RIM, SIDES, SURFACE, UPRIGHT, Support
+from ...scene.supports import CORNER, RIM, SIDES, SURFACE, UPRIGHT, Support
 from ...trace.scalars import Value, absolute, inverse_root, less, select
 from ...trace.spatial import Twist, Vector, cross, dot, total
 
@@ -29,10 +29,15 @@ class SupportPlacement(NamedTuple):
     bend: Callable[[Twist, Twist], Value]
 
 
-def place_support(support: Support, axes: list[Vector], sizes: list[Value], normal: Vector) -> SupportPlacement:
-    """Return where the point is; ``axes`` of the shape and ``normal`` of the ground in the link's axes."""
+def place_support(
+    support: Support, axes: list[Vector], sizes: list[Value], signs: list[Value], normal: Vector
+) -> SupportPlacement:
+    """Return where the point is; ``axes`` of the shape and ``normal`` of the ground in the link's axes.
+
+    ``sizes``, ``signs``: those of the support.
+    """
     n = Vector(dot(axis, normal) for axis in axes)
-    return PLACES[support.kind](support, axes, sizes, n, normal)
+    return PLACES[support.kind](support, axes, sizes, signs, n, normal)
 
 
 def _turned(axes: list[Vector], local: list[Value]) -> Vector:
@@ -43,23 +48,27 @@ def _still(twist: Twist, change: Twist) -> Value:
     return 0.0
 
 
-def _corner(support: Support, axes: list[Vector], half: list[Value], n: Vector, normal: Vector) -> SupportPlacement:
+def _corner(
+    support: Support, axes: list[Vector], half: list[Value], signs: list[Value], n: Vector, normal: Vector
+) -> SupportPlacement:
     x, y, z = (absolute(part) for part in n)
     is_x = (1.0 - less(x, y)) * (1.0 - less(x, z))
     is_y = select(is_x, 0.0, 1.0 - less(y, z))
     is_z = select(is_x, 0.0, select(is_y, 0.0, 1.0))
-    first, second = (1.0 if support.number & bit else -1.0 for bit in (1, 2))
+    first, second = signs
     down = [select(less(0.0, part), -1.0, 1.0) for part in n]
-    signs = [
+    places = [
         select(is_x, down[0], first),
         select(is_y, down[1], select(is_x, first, second)),
         select(is_z, down[2], second),
     ]
-    offset = _turned(axes, [sign * size for sign, size in zip(signs, half, strict=True)])
+    offset = _turned(axes, [sign * size for sign, size in zip(places, half, strict=True)])
     return SupportPlacement(offset, offset, _still)
 
 
-def _rim(support: Support, axes: list[Vector], sizes: list[Value], n: Vector, normal: Vector) -> SupportPlacement:
+def _rim(
+    support: Support, axes: list[Vector], sizes: list[Value], signs: list[Value], n: Vector, normal: Vector
+) -> SupportPlacement:
     top, bottom, half = sizes
     square = n[0] * n[0] + n[1] * n[1]
     leans = less(UPRIGHT, square)
@@ -81,7 +90,9 @@ def _rim(support: Support, axes: list[Vector], sizes: list[Value], n: Vector, no
     return SupportPlacement(hub + spoke, hub, bend)
 
 
-def _lowest(support: Support, axes: list[Vector], half: list[Value], n: Vector, normal: Vector) -> SupportPlacement:
+def _lowest(
+    support: Support, axes: list[Vector], half: list[Value], signs: list[Value], n: Vector, normal: Vector
+) -> SupportPlacement:
     u = Vector(a * x for a, x in zip(half, n, strict=True))
     inverse = inverse_root(dot(u, u))
     offset = _turned(axes, [-(a * (x * inverse)) for a, x in zip(half, u, strict=True)])
@@ -96,4 +107,4 @@ def _lowest(support: Support, axes: list[Vector], half: list[Value], n: Vector, 
     return SupportPlacement(offset, Vector((0.0, 0.0, 0.0)), bend)
 
 
-PLACES = {FACE: _corner, RIM: _rim, SURFACE: _lowest}
+PLACES = {CORNER: _corner, RIM: _rim, SURFACE: _lowest}
