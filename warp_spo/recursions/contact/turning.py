@@ -60,7 +60,7 @@ def turning_names(scene: Scene, variable: Collection[str], number: int) -> tuple
 @cached_by_scene
 def turning_scales(scene: Scene) -> list[TurningScale]:
     """Return the constants of each contact point."""
-    frames = tuple((point.body, point.position) for point in scene.contact_points)
+    frames = tuple((point.body, tuple(point.place((0.0, 0.0, 1.0)))) for point in scene.contact_points)
     found = []
     weights = (effective_mass.inverse_weights(scene, frames, turning) for turning in (False, True))
     for moves, turns in zip(*weights, strict=True):
