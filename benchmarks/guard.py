@@ -6,6 +6,7 @@
 At one step in four, an observation, a reward, a state or an action of a random world becomes NaN, inf, 1e12 or 1e30.
 Afterwards all weights and normalisers have to be finite, every spoilt number has to be counted under its name, and the
 rewards of a step at each iteration, means over trainings, have to lie within the spread of seeds without such numbers.
+In trainings without them a termination ends a world instead, as often: more new starts alone change what is learned.
 """
 
 from __future__ import annotations
@@ -44,26 +45,27 @@ CONDITIONS = (
 class SpoiltEnv(Env):
     """A task's environment, in which a step may spoil a number of one world."""
 
-    def __init__(self, *args: Any, observations: Any, rewards: Any, **options: Any):
+    def __init__(self, *args: Any, observations: Any, rewards: Any, terminations: Any = None, **options: Any):
         self.causes = [f"reward/{name}" for name in rewards]
         groups = {}
         for group, terms in observations.items():
             terms = [each if isinstance(each, Observation) else Observation(each) for each in terms]
             self.causes += [f"observation/{group}/{label}" for label in term_labels(terms)]
             groups[group] = terms
-        places, size = iter(range(len(self.causes))), len(self.causes)
+        places, size = iter(range(len(self.causes))), len(self.causes) + 1  # the last one ends the world
+        ends = dict(terminations or {}) | {"at random": lambda w: w.memory("planted", size, reset=None)[size - 1] > 0.5}
         rewards = {name: (weight, spoil(term, next(places), size)) for name, (weight, term) in rewards.items()}
         groups = {
             group: [dataclasses.replace(each, term=spoil(each.term, next(places), size)) for each in terms]
             for group, terms in groups.items()
         }
-        super().__init__(*args, observations=groups, rewards=rewards, **options)
-        self.begin(0, 0)
+        super().__init__(*args, observations=groups, rewards=rewards, terminations=ends, **options)
+        self.begin(0, 0, False)
 
-    def begin(self, seed: int, steps: int) -> None:
-        """Start anew, and spoil numbers in the next ``steps`` steps, but not in the last two of them."""
+    def begin(self, seed: int, steps: int, spoils: bool) -> None:
+        """Start anew; in the next ``steps`` steps, but the last two, spoil numbers, or end worlds if not ``spoils``."""
         self.reset(seed=seed)
-        self.random, self.left, self.last = np.random.default_rng(seed), steps, -1
+        self.random, self.left, self.last, self.spoils = np.random.default_rng(seed), steps, -1, spoils
         self.spoilt: Counter = Counter()
         self.curve: list[float] = []
 
@@ -73,7 +75,10 @@ class SpoiltEnv(Env):
         planted, world = self.memory("planted"), -1
         if self.left > 1 and self.random.random() < SHARE:
             world = int(self.random.choice([i for i in range(self.num_envs) if i != self.last]))
-            actions = self._spoil(actions, planted, world)
+            if self.spoils:
+                actions = self._spoil(actions, planted, world)
+            else:
+                planted[world, -1] = 1.0
         self.last = world
         found = super().step(actions)
         planted.zero_()
@@ -127,7 +132,7 @@ def spoil(term: Any, place: int, size: int) -> Any:
 def train(env: SpoiltEnv, learner: Learner, seed: int, iterations: int, spoils: bool) -> dict[str, Any]:
     """Return the rewards of a step at each iteration, and what the guard let through or did not count."""
     torch.manual_seed(seed)
-    env.begin(seed, iterations * learner.steps if spoils else 0)
+    env.begin(seed, iterations * learner.steps, spoils)
     runner = make_runner(env, learner)
     runner.learn(iterations, init_at_random_ep_len=True)
     tensors = [x for model in (runner.alg.actor, runner.alg.critic) for x in model.state_dict().values()]
@@ -146,9 +151,14 @@ def measure(name: str, worlds: int, trainings: int, clean: int, iterations: int)
     chosen, began = task(name), time.time()
     with mock.patch.object(chosen, "Env", SpoiltEnv):
         env = chosen.build(worlds, "cpu")
-    learner = dataclasses.replace(chosen.LEARNER, worlds=worlds, hidden=(64, 64))
-    without = [train(env, learner, 1000 + i, iterations, False) for i in range(clean)]
-    spoilt = [train(env, learner, i, iterations, True) for i in range(trainings)]
+    learner = dataclasses.replace(chosen.LEARNER, worlds=worlds, hidden=(64, 64), batches=1)
+    runs = []
+    for i in range(clean + trainings):
+        runs.append(train(env, learner, i, iterations, i >= clean))
+        print(
+            f"{name}: training {i + 1} of {clean + trainings}, {time.time() - began:.0f} s", file=sys.stderr, flush=True
+        )
+    without, spoilt = runs[:clean], runs[clean:]
     means, others = (np.mean([each["curve"] for each in some], axis=0) for some in (spoilt, without))
     spread = np.std([each["curve"] for each in without], axis=0, ddof=1) if clean > 1 else np.full(iterations, np.nan)
     away = np.abs(means - others) / spread
@@ -192,7 +202,7 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--trainings", type=int, default=50, metavar="N", help="with spoilt numbers, of each task")
     p.add_argument("--clean", type=int, default=20, metavar="N", help="without")
     p.add_argument("--iterations", type=int, default=30, metavar="N")
-    p.add_argument("--worlds", type=int, default=64, metavar="N")
+    p.add_argument("--worlds", type=int, default=32, metavar="N")
     p.add_argument("--json", type=Path, metavar="FILE")
     options = p.parse_args(argv)
     if unknown := [name for name in options.tasks if name not in TASKS]:
