@@ -10,10 +10,10 @@ One question each, on a GPU:
     plan's choice), ``depth`` (scans), ``variable`` (values that are read), ``substeps``, ``step_parts`` (SolverSPO's
     step), ``actuators``, ``flexible``, ``capabilities`` (other solvers), ``host_time``, ``jax_check``, ``many_gpus``.
 Accuracy, mostly on a CPU:
-    ``stress/``, ``stability`` (robots under gravity), ``spin`` (what turns freely), ``frames`` (where frames lie), ``gradients`` (rollouts),
-    ``robot_files`` and ``mjcf_files`` (readers), ``robots_of_others`` (files that are not installed),
-    ``joint_limits`` (of MJCF), ``fuzz`` (damaged files), ``inverse_kinematics``, ``flexible_peers``, ``boom`` (beams),
-    ``newton_tests`` (Newton's own tests of solvers; ``newton_judgements`` of their failures).
+    ``stress/``, ``stability`` (robots under gravity), ``spin`` (what turns freely), ``frames`` (where frames lie),
+    ``gradients`` (rollouts), ``robot_files`` and ``mjcf_files`` (readers), ``robots_of_others`` (files that are not
+    installed), ``joint_limits`` (of MJCF), ``fuzz`` (damaged files), ``inverse_kinematics``, ``flexible_peers``,
+    ``boom`` (beams), ``newton_tests`` (Newton's own tests of solvers; ``newton_judgements`` of their failures).
 Contact:
     ``contact/``: times and errors, energy, every promised figure, other engines, gradients, terrain.
 Learning:
