@@ -24,7 +24,7 @@ from ..kinematics import NEUTRAL, relative_quaternion
 from ..model.links import Link, place_link
 from ..motion import STILL, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
-from .free_rotation import turn_alone, turns_alone
+from .free_rotation import inertia_about_center, normalize, rotate_freely, turn_alone, turns_alone, turns_freely
 from .joint_laws import DEFAULT_BOUND
 
 if TYPE_CHECKING:
@@ -128,7 +128,12 @@ def _carry(
     at_rest = link.hinge.quaternion_at_rest(link)
     start, end = multiply(parent_before.turn, at_rest), multiply(parent.turn, at_rest)
     raw = Vector(q(link.coordinate + 3 + c) for c in range(4))
-    quaternion = multiply(Vector((-end[0], -end[1], -end[2], end[3])), rotate_by(multiply(start, raw), spin * h))
+    if turns_freely(link):
+        turn, spin = rotate_freely(inertia_about_center(link), body.axes, body.spin, spin_gain, h)
+        turned = normalize(multiply(turn, multiply(start, raw)))
+    else:
+        turned = rotate_by(multiply(start, raw), spin * h)
+    quaternion = multiply(Vector((-end[0], -end[1], -end[2], end[3])), turned)
     center = body.origin + velocity * h
     anchor = parent.axes if link.matrix is None else parent.axes @ link.matrix
     position = anchor.T @ (center - parent.origin - parent.axes @ link.offset)

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 NEWTON_STEPS = 2
 MOST_TURN = 0.5  # rad
 SLOPES = (1.0 / 3.0, 2.0 / 15.0, 17.0 / 315.0, 62.0 / 2835.0)  # of tan(x) / x by the square of x; 1e-8 at x = 1/4
+ROUND = 1e-12  # share of a moment of inertia by which a body may not be round, as after a rotation of its axes
 STILL = Vector((0.0, 0.0, 0.0, 1.0))  # the quaternion of no turn
 
 
@@ -49,6 +50,11 @@ def turns_alone(link: Link, scene: Scene) -> bool:
     return is_gyroscopic(link)
 
 
+def turns_freely(link: Link) -> bool:
+    """Return whether a free body on a link that moves carries nothing, and has gyroscopic torques about its frame."""
+    return not link.children and is_gyroscopic(link) and link.inertia.moment.vanishes  # type: ignore[union-attr]
+
+
 def is_gyroscopic(link: Link) -> bool:
     """Return whether a link is on a free or ball hinge and has an inertia that depends on how it is turned."""
     if link.hinge.name not in ("free", "ball") or link.shared_dofs is not None or link.inertia is None:
@@ -59,10 +65,11 @@ def is_gyroscopic(link: Link) -> bool:
     if not all(x is armature[0] or (is_constant(x) and x == armature[0]) for x in armature):
         return False
     entries = [x for row in inertia_about_center(link) for x in row]
-    round_body = all(map(is_constant, entries)) and all(
-        x == (entries[0] if i % 4 == 0 else 0.0) for i, x in enumerate(entries)
-    )
-    return not round_body
+    if not all(map(is_constant, entries)):
+        return True
+    moment = float(entries[0])  # type: ignore[arg-type]
+    round_entries = [moment, 0.0, 0.0, 0.0, moment, 0.0, 0.0, 0.0, moment]
+    return any(abs(x - y) > ROUND * moment for x, y in zip(entries, round_entries, strict=True))  # type: ignore
 
 
 def inertia_about_center(link: Link) -> Matrix:
@@ -83,6 +90,8 @@ def rotate_freely(inertia: Matrix, axes: Matrix, rate: Vector, gain: Vector, h: 
         inertia: in axes of the body, which are ``axes`` before the step. rate, gain: angular velocity before the step,
             and its change by the sweeps, in the axes that ``axes`` lead to. h: length of the step.
     """
+    scale = reciprocal(inertia[0][0] + inertia[1][1] + inertia[2][2])  # rates need only the ratios of moments
+    inertia = Matrix(Vector(row) * scale for row in inertia)
     before = axes.T @ rate
     start = before + axes.T @ gain
     gyroscopic = cross(before, inertia @ before) * h
@@ -102,7 +111,7 @@ def rotate_freely(inertia: Matrix, axes: Matrix, rate: Vector, gain: Vector, h: 
         further = further - solve(inertia + Matrix(Vector(row) * half for row in rows), error)
         omega = start + further
     quarter = omega * half
-    turn = Vector((*quarter, 1.0)) * reciprocal(sqrt(1.0 + dot(quarter, quarter)))
+    turn = normalize(Vector((*quarter, 1.0)))
     back = Vector((-turn[0], -turn[1], -turn[2], turn[3]))
     momentum = inertia @ start + gyroscopic
     more = solve(inertia, gyroscopic + change_when_turned(back, momentum))
@@ -118,6 +127,11 @@ def change_when_turned(turn: Quaternion, v: Vector) -> Vector:
     u = Vector(turn[:3])
     twice = cross(u, v) * 2.0
     return twice * turn[3] + cross(u, twice)
+
+
+def normalize(quaternion: Quaternion) -> Quaternion:
+    """Return the quaternion, of unit length."""
+    return quaternion * reciprocal(sqrt(dot(quaternion, quaternion)))
 
 
 def solve(matrix: Matrix, right: Vector) -> Vector:
@@ -136,8 +150,7 @@ def turn_alone(link: Link, q: Entry, qd: Entry, rates: dict[int, Value], h: Valu
     spin, gain = Vector(before[-3:]), Vector(after[-3:]) - Vector(before[-3:])
     found = rotate_freely(inertia_about_center(link), axes, spin, gain, h)
     free = link.hinge.name == "free"
-    turned = multiply(found.turn, Vector(q(at + (3 if free else 0) + i) for i in range(4)))
-    turned = turned * reciprocal(sqrt(dot(turned, turned)))
+    turned = normalize(multiply(found.turn, Vector(q(at + (3 if free else 0) + i) for i in range(4))))
     if not free:
         return list(turned), list(found.after)
     velocity = Vector(after[:3])
