@@ -117,7 +117,7 @@ class Comparison:
         for name, (change, most) in task.ties(s).items():
             unit = task.rewards(s)[name][0] * dt * change
             times = np.round((reward.double().numpy() - sum(terms.values())) / unit)
-            terms[name] = terms[name] + unit * np.where(np.abs(times) <= most, times, 0.0)
+            terms[name] = terms[name] + unit * np.where((np.abs(times) <= most) & ~spoilt, times, 0.0)
         total = np.where(spoilt, 0.0, sum(terms.values()))
         ends = task.ends(s)
         terminated = np.any([spoilt, *ends.values()], axis=0)
@@ -189,7 +189,8 @@ class Comparison:
             own = self.sums.setdefault(name, np.zeros(env.num_envs))
             own += np.where(spoilt, 0.0, term)  # a step that the guard ends earns nothing
             held = (env.memory(f"{kind} reward {name}")[:, 0].numpy() for kind in ("last", "sum"))
-            self._near(f"sum of the reward {name}", own, np.where(done, *held), SUMS * max(1.0, np.abs(own).max()))
+            most = SUMS * max(1.0, np.abs(own).max())
+            self._near(f"sum of the reward {name}", own, np.where(done, *held), most)
         for name, holds in ends.items():
             self._same(f"end: {name}", holds[done], env.memory(f"last end {name}")[:, 0].numpy()[done])
 

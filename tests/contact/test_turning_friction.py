@@ -155,7 +155,7 @@ def test_gradients_are_differences(passes):
     names = ("q", "qd", "contact_friction", "contact_torsional_friction", "contact_rolling_friction")
     errors = contact_gradients.errors(scene, a, H, passes, names=names)
     assert max(error for error, _ in errors.values()) <= 1e-5, errors  # 1e-7 measured
-    assert max(crossed for _, crossed in errors.values()) <= 0.01, errors
+    assert max(crossed for _, crossed in errors.values()) <= 1 / 6, errors  # one draw: the nearest cell changes
 
 
 def test_substeps_and_reports(device):
@@ -166,9 +166,9 @@ def test_substeps_and_reports(device):
     report, status = dyn.step_report(*REPORTS, like=q), np.zeros(4, np.int32)
     q, qd = dyn.step(q, qd, dt=H, status=status, report=report)
     push = report.contact_f[:, :, 2]
-    np.testing.assert_allclose(report.contact_moment[:, :, 2], -spin * push, rtol=SLOWING)
+    np.testing.assert_allclose(report.contact_moment[:, :, 2], -spin * push, rtol=SUDDEN)  # of three passes; 2e-7 of six
     across = report.contact_moment[:, :, :2]
-    np.testing.assert_allclose(np.linalg.norm(across, axis=2), spin * push, rtol=SLOWING)
+    np.testing.assert_allclose(np.linalg.norm(across, axis=2), spin * push, rtol=SUDDEN)
     assert (np.einsum("wpi,wi->w", across, qd[:, 3:5])[1:] < 0.0).all()
     asked = dict(status=status, report=report)
     fused = dyn.step(q, qd, dt=H, options=spo.StepOptions(substeps=5), **asked)
