@@ -82,6 +82,13 @@ def test_a_box_sinks_by_a_hundredth_of_half_its_size(size, sink):
     np.testing.assert_allclose(values_of(scene)[0], 2.0 * 9.81 / (4.0 * sink))
 
 
+def test_places_beyond_all_numbers_have_a_stiffness():
+    """A decomposition of their widths would not end."""
+    contacts = [spo.Contact(0, point=tuple(place)) for place in np.diag([1e308, 1e308, 1e308])]
+    scene = spo.Scene([spo.Body(2.0, inertia=np.eye(3))], [spo.Hinge("free", -1, 0)], contacts=contacts)
+    np.testing.assert_allclose(values_of(scene)[0], 2.0 * 9.81 / 3e-4)
+
+
 def test_pairs_carry_what_pairs_connect():
     """A load and what it lies on have the stiffness of both; that of what lies apart is its own, and no tree's is more
     than 1e9 1/s^2 of its mass."""

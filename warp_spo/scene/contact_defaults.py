@@ -24,6 +24,7 @@ FLAT = 1e-3  # of the longest extent of points, below which another extent is no
 POINTS_AT_REST = 4  # points at most on which a robot rests
 DAMPING_TIME = 1e-2  # damping over stiffness [s]: what is deep comes out at depth over this, whatever its mass
 STIFFEST = 1e9  # of stiffness over the mass of the tree [1/s^2], at most
+LARGEST = 1e100  # of what has a width [m]: a decomposition does not end on numbers that are not finite
 STANDARD_GRAVITY = 9.81  # [m/s^2], in scenes without gravity
 
 
@@ -81,6 +82,8 @@ class NeutralPose(Stored):
         where b is half the width that holds it up and l how high its tree's centre of mass may be above the points.
         """
         centred = points - points.mean(axis=0)
+        if not np.abs(centred).max() < LARGEST:
+            return STATIC_SINK
         widths = np.sort(np.ptp(centred @ np.linalg.svd(centred, full_matrices=False)[2].T, axis=0))[::-1] / 2.0
         widths = widths[widths > FLAT * widths[0]]
         tree, found = self.roots == self.roots[body], [STATIC_SINK]
