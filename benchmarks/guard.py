@@ -26,7 +26,7 @@ from unittest import mock
 import numpy as np
 import torch
 
-from warp_spo.env import Observation
+from warp_spo.env import Observation, settings
 from warp_spo.env.bounds import term_labels
 from warp_spo.env.environment import Env
 from warp_spo.env.learning import Learner, make_runner, pick_device
@@ -149,7 +149,7 @@ def train(env: SpoiltEnv, learner: Learner, seed: int, iterations: int, spoils: 
 def measure(name: str, worlds: int, trainings: int, clean: int, iterations: int) -> dict[str, Any]:
     """Return the figures of a task."""
     chosen, began = task(name), time.time()
-    with mock.patch.object(chosen, "Env", SpoiltEnv):
+    with mock.patch.object(settings, "Env", SpoiltEnv):
         env = chosen.build(worlds, "cpu")
     learner = dataclasses.replace(chosen.LEARNER, worlds=worlds, hidden=(64, 64), batches=1)
     runs = []

@@ -168,7 +168,7 @@ def creep(dt: float, make: Callable) -> Iterator[Figure]:
     """A box on a slope of 20 degrees whose friction is a little more than it needs."""
     slope, ratios = np.radians(20.0), (1.01, 1.05, 1.5)
     scene = column((5.0,), [(0.1, 0.1, 0.1)]).with_values(gravity=[G * np.sin(slope), 0.0, -G * np.cos(slope)])
-    friction = np.array(ratios)[:, None] * np.tan(slope) * np.ones((1, 8))
+    friction = np.array(ratios)[:, None] * np.tan(slope) * np.ones((1, scene.contact_count))
     found = roll(make(scene.with_values(contact_friction=friction), 3), [[0, 0, 0.1, 0, 0, 0, 1]] * 3, dt, 2.0)
     for ratio, speed, asked in zip(ratios, np.linalg.norm(found.qd[:, :2], axis=1), (0.8, 0.5, 0.1), strict=True):
         yield Figure(f"friction {ratio:g} times what it needs: creep [mm/s]", 1e3 * speed, asked)

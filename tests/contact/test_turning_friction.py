@@ -22,7 +22,6 @@ SPIN, ROLL = 5e-3, 2e-3  # coefficients [m]
 REPORTS = ("contact_f", "contact_moment", "contact_excess")
 EXACT = {"float64": 1e-12, "float32": 1e-5}  # of a rate that nothing changes
 SLOWING = 2e-3  # of what a moment takes off: the secant of three passes, 8e-4 measured at 10 ms; a damper at low rates
-SUDDEN = 1e-2  # relative error of a moment after three passes of a step in which the push changes; 2e-7 after six
 STOPPED = {"float64": 1e-6, "float32": 2e-5}  # rates [rad/s, m/s] and moments [N m] of what has stopped
 ROUNDING = 1e-11  # of the energy before, as in test_contact_reference
 
@@ -165,11 +164,12 @@ def test_substeps_and_reports(device):
     spin, qd = np.array([[0.0], [SPIN], [2.0 * SPIN], [SPIN]]), np.tile([0.1, 0.0, -0.1, 0.3, 1.0, 3.0], (4, 1))
     dyn.set(contact_torsional_friction=spin, contact_rolling_friction=spin, gravity=np.array([0.0, 0.0, -G]))
     report, status = dyn.step_report(*REPORTS, like=q), np.zeros(4, np.int32)
-    q, qd = dyn.step(q, qd, dt=H, status=status, report=report)
+    settled = spo.StepOptions(passes=6)  # three passes miss by 2e-2 in this step, in which the push changes
+    q, qd = dyn.step(q, qd, dt=H, options=settled, status=status, report=report)
     push = report.contact_f[:, :, 2]
-    np.testing.assert_allclose(report.contact_moment[:, :, 2], -spin * push, rtol=SUDDEN)
+    np.testing.assert_allclose(report.contact_moment[:, :, 2], -spin * push, rtol=1e-4)
     across = report.contact_moment[:, :, :2]
-    np.testing.assert_allclose(np.linalg.norm(across, axis=2), spin * push, rtol=SUDDEN)
+    np.testing.assert_allclose(np.linalg.norm(across, axis=2), spin * push, rtol=1e-4)
     assert (np.einsum("wpi,wi->w", across, qd[:, 3:5])[1:] < 0.0).all()
     asked = dict(status=status, report=report)
     fused = dyn.step(q, qd, dt=H, options=spo.StepOptions(substeps=5), **asked)

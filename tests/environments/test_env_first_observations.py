@@ -277,7 +277,7 @@ READY = {
 }  # fmt: skip
 """Ready terms, or what returns them with the term, and the truth."""
 OTHERS = {
-    observations: ("name_of",),
+    observations: ("name_of", "place_of"),
     rewards: ("square", "moving"),
     terminations: (),
     velocity: ("observed", "starts", "randomisation"),
@@ -414,9 +414,10 @@ def test_everything_that_terms_may_read_is_walked():
 
 
 def make_layout():
+    from warp_spo.env.compile.guard import Guard
     from warp_spo.env.compile.memory_layout import MemoryLayout
 
-    return MemoryLayout(scene(), np.zeros(9), 0.02, None, ())
+    return MemoryLayout(scene(), np.zeros(9), 0.02, None, (), Guard({}))
 
 
 @pytest.mark.slow

@@ -142,7 +142,9 @@ PLANTED = {
     "axes of an inertia": lambda m: changed(m["mechanism"], "rotation", lambda axes: axes.T),
     "places of sites": lambda m: changed(m["model"], "xyzw", lambda turn: turn * [1, 1, 1, -1]),
     "bias of actuators": lambda m: changed(m["actuators"], "_gain_and_bias", lambda both: (both[0], (0.0, 0.0, 0.0))),
-    "friction of contacts": lambda m: changed(m["collision_shapes"], "_friction", lambda value: value + 0.1),
+    "friction of contacts": lambda m: changed(
+        m["collision_shapes"], "_frictions", lambda found: found | {"friction": found["friction"] + 0.1}
+    ),
     "softness is not said": lambda m: mock.patch.object(m["model"], "_softness", lambda source: []),
     "offset of a coupling": lambda m: changed(
         m["equality_constraints"], "_coupling", lambda one: dataclasses.replace(one, offset=one.offset + 0.1)

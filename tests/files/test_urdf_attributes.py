@@ -53,7 +53,7 @@ PLANTED = {
     "frame of an inertia": lambda: changed(urdf, "_rotation", lambda turn: turn.T),
     "mimics": lambda: changed(urdf, "read_mimics", lambda mimics: mimics._replace(couplings=[
         one.__class__(one.hinge, one.reference, one.ratio, 0.0) for one in mimics.couplings])),
-    "friction of contacts": lambda: changed(urdf_shapes, "_urdf_friction", lambda value: None),
+    "friction of contacts": lambda: changed(urdf_shapes, "_urdf_frictions", lambda found: {"friction": None}),
     "nothing is named": lambda: mock.patch.object(urdf, "_warn_of_limits", lambda joints, held: None),
 }  # fmt: skip
 
