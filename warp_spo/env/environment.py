@@ -71,7 +71,7 @@ class Env(VecEnv):
         graph: whether a step is one CUDA graph; None: on CUDA it is.
         final_observations: whether ``extras["final_observations"]`` holds what was observed after the step and before
             new starts, the last observation of worlds whose episode has ended.
-        bounds: sizes of actions, states, observations and rewards that end a world; None: those of :class:`Bounds`.
+        bounds: sizes of actions, states, observations and rewards that end a world; None: those of ``Bounds``.
         log_interval: steps after which ``extras["log"]`` comes again.
 
     Attributes:

@@ -136,13 +136,13 @@ def changed(held: Any, given: Any, place: str) -> Any:
 
 
 def make_env(scene: Any, worlds: int, device: Any, options: Mapping[str, Any], **own: Any) -> Env:
-    """Return an environment of a task: ``own`` arguments of :class:`Env`, in which ``options`` are put in place.
+    """Return an environment of a task: ``own`` arguments of ``Env``, in which ``options`` are put in place.
 
     An option replaces a number of ``own``, or parts of what is there: ``rewards={"velocity": 3.0}`` is another weight,
-    ``commands={"forward": (-2.0, 2.0)}`` another range. Arguments that ``own`` has not go to :class:`Env`.
+    ``commands={"forward": (-2.0, 2.0)}`` another range. Arguments that ``own`` has not go to ``Env``.
 
     Raises:
-        ValueError: as :func:`changed`.
+        ValueError: a name is unknown, or a value of another kind.
     """
     known = list(inspect.signature(Env.__init__).parameters)[2:]
     found = dict(own)
