@@ -93,7 +93,7 @@ def test_a_stack_stands(device):
     fastest, drift, _, force = stand(scene, stacked(5), 5.0, 10.0, device)
     assert fastest < 1e-5 and drift < 1e-4
     carried = 9.81 * 5.0 * np.arange(5, 0, -1)
-    np.testing.assert_allclose(np.append(force[:8, 2].sum(), force[8:, 2]), carried, rtol=1e-4)
+    np.testing.assert_allclose(np.append(force[:4, 2].sum(), force[4:, 2]), carried, rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -103,8 +103,8 @@ def test_a_heavy_cube_on_light_ones(device):
     scene = stack(masses, ground=1e6, stiffness=1e6, damping=4e3)
     fastest, _, q, force = stand(scene, stacked(5, offset=0.0), 3.0, 0.5, device)
     carried = 9.81 * np.cumsum(masses[::-1])[::-1]
-    np.testing.assert_allclose(force[8:, 2], carried[1:], rtol=1e-4)
-    sunk = carried[0] / 8e6 * 2.0 + (carried[1:] / 1e6).sum()  # four corners carry the lowest
+    np.testing.assert_allclose(force[4:, 2], carried[1:], rtol=1e-4)
+    sunk = carried[0] / 4e6 + (carried[1:] / 1e6).sum()  # four corners carry the lowest
     assert fastest < 1e-4
     np.testing.assert_allclose(0.9 - q[30], sunk, rtol=0.02)
 

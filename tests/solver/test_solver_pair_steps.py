@@ -84,7 +84,7 @@ def test_a_step_is_that_of_a_scene_by_hand():
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_impulses_are_equal_and_opposite(dtype):
     """A ball flies against a cube: both keep their momentum, of the solver's steps and of its scene in float64."""
-    one, bound = newton.ModelBuilder(), {"float32": 1e-6, "float64": 1e-12}[dtype]
+    one, bound = newton.ModelBuilder(), {"float32": 1e-5, "float64": 1e-12}[dtype]  # 60 steps round each velocity once
     free_cube(one, "cube", (0.0, 0.0, 0.0), density=500.0)
     ball = one.add_body(xform=wp.transform(wp.vec3(0.2, 0.03, 0.0), wp.quat_identity()), label="ball")
     one.add_shape_sphere(ball, radius=0.05, cfg=config(), label="ball")
@@ -148,8 +148,8 @@ def test_a_cube_stands_on_a_table():
     run(solver, state, 200, observables=seen)
     weight, force = WALL.density * (2 * SIDE) ** 3 * GRAVITY, seen.contact_f.numpy()[..., 2]
     np.testing.assert_allclose(force[:, -1], weight, rtol=1e-4)
-    np.testing.assert_allclose(force[:, 8:16].sum(axis=1), weight, rtol=1e-4)
-    assert not force[:, :8].any() and not seen.status.numpy().any()
+    np.testing.assert_allclose(force[:, 4:8].sum(axis=1), weight, rtol=1e-4)
+    assert not force[:, :4].any() and not seen.status.numpy().any()
     push = control.joint_f.numpy().reshape(2, 2, 6)
     push[:, 0, 0] = [0.4 * weight, 0.6 * weight]  # friction is 0.5
     control.joint_f.assign(push.ravel())
@@ -267,7 +267,7 @@ def test_a_step_of_the_gripper_is_that_of_the_librarys_own_scene():
     """From the moment in which the cube is held; the same forces, and both pads carry the cube's weight."""
     model = newton_grasp.model(2)
     solver, dyn = SolverSPO(model, pairs=newton_grasp.PAIRS), spo.Dynamics(own_scene(), 2, dtype="float32")
-    assert len(solver.dynamics.scene.contact_points) == 24 and len(solver.dynamics.scene.contact_pairs) == 2
+    assert len(solver.dynamics.scene.contact_points) == 12 and len(solver.dynamics.scene.contact_pairs) == 2
     _, _, q = grasp.path(dyn, 1.0)
     q[:, 7:9] = grasp.CUBE - 4e-4
     q, qd = q.astype(np.float32), np.zeros((2, 15), np.float32)
@@ -279,7 +279,7 @@ def test_a_step_of_the_gripper_is_that_of_the_librarys_own_scene():
     state.joint_qd.assign(qd.ravel())
     control.joint_f.assign(tau.ravel())
     control.joint_target_q.assign(q.ravel())
-    seen, force = solver.observables({"contact_f", "status"}), np.zeros((2, 26, 3), np.float32)
+    seen, force = solver.observables({"contact_f", "status"}), np.zeros((2, 14, 3), np.float32)
     seen.contact_f.fill_(np.nan)
     for _ in range(3):
         target = np.float32(control.joint_target_q.numpy().reshape(2, -1))
@@ -298,4 +298,4 @@ def test_a_gripper_holds_a_cube(capsys):
     late = times > 2.0
     assert height[-1, 0] > 0.17 and np.ptp(apart[late, 0]) < SLIP  # 0.37 mm here
     assert height[-1, 1] < grasp.CUBE + 1e-3  # a friction of 0.05 holds nothing
-    assert not words.any() and "slips by 0.4" in capsys.readouterr().out
+    assert not words.any() and "slips by 0.03" in capsys.readouterr().out
