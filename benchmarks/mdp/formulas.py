@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from warp_spo.env.robots import FILES, TOUCH
-from warp_spo.reference.contact import surfaces
+from warp_spo.reference.field_spheres import nearest_points
 
 FORCE = 1.0  # above which a foot touches [N]
 
@@ -135,11 +135,11 @@ class Robot:
         if self.model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE:
             axis = self.data.geom_xmat[geom].reshape(3, 3)[:, 2]
             center += (-1.0, 1.0)[end] * self.model.geom_size[geom, 1] * axis
-        lowest = center - np.array([0.0, 0.0, radius])
         if self.field is None:
-            return float(lowest[2])
+            return float(center[2] - radius)
         walls = "foot" in self.model.geom(geom).name  # of go2-rough: trunk and knees see no walls
-        return -max(depth for _, depth in surfaces(self.field, lowest, walls=walls))
+        both = walls and (self.field.has_walls or self.field.has_creases)
+        return -max(depth for _, depth in nearest_points(self.field, center, radius, both=both))
 
     # -- base ------------------------------------------------------------------------------------------------------
     def in_base(self, s: State, v: np.ndarray) -> np.ndarray:

