@@ -77,7 +77,8 @@ class Runner(OnPolicyRunner):
         again = bool(self.unwritten) and iteration % log.every == 0
         asked = self.stop.signal or (signal.SIGTERM if is_orphan() else 0)
         asked, late, again = self._largest(asked, time.time() > log.ends, again)
-        self.stop.signal = asked
+        if asked:  # a signal that came while the processes agreed counts after the next iteration
+            self.stop.signal = asked
         ends = bool(asked or late)
         if ends or again or iteration + 1 == total or iteration % self.cfg["save_interval"] == 0:
             self.save_all(iteration)
