@@ -1,4 +1,4 @@
-"""What the values give that contacts have by default: what rests, stands, holds, creeps, and leaves the ground.
+"""Contacts with their default values: bodies that rest, stand, are held, creep, and leave the ground.
 
     python -m benchmarks.contact.defaults [CASE...] [--dtype float32 float64] [--steps 1 2 5 10] [--mjlab FOLDER]
         [--json FILE]
@@ -198,7 +198,7 @@ def limp(scene: spo.Scene) -> spo.Scene:
     return scene.with_values(**{f"joint_{name}": np.zeros(scene.dof_count) for name in names})
 
 
-def thrown(scene: spo.Scene, dt: float, worlds: int, name: str, lost: float | None) -> Iterator[Figure]:
+def throw(scene: spo.Scene, dt: float, worlds: int, name: str, lost: float | None) -> Iterator[Figure]:
     """Throw a robot for a second, in float32, see :mod:`.throws`."""
     before, throws.DT = throws.DT, dt
     found = throws.throw(scene, worlds, 3, "cpu", 0)
@@ -217,8 +217,8 @@ def throws_of_g1(dt: float, make: Callable) -> Iterator[Figure]:
     """G1 with 18 points, limp and with drives."""
     driven = scenes.scene("g1")
     zero = np.zeros(driven.dof_count)
-    yield from thrown(driven.with_values(joint_target_ke=zero, joint_target_kd=zero), dt, 64, "limp", 0)
-    yield from thrown(driven, dt, 64, "drives", 0)
+    yield from throw(driven.with_values(joint_target_ke=zero, joint_target_kd=zero), dt, 64, "limp", 0)
+    yield from throw(driven, dt, 64, "drives", 0)
 
 
 def throws_of_mjlab(dt: float, make: Callable, folder: Path | None = None) -> Iterator[Figure]:
@@ -231,7 +231,7 @@ def throws_of_mjlab(dt: float, make: Callable, folder: Path | None = None) -> It
         own = Path(place) / "g1.xml"
         own.write_text(without_meshes(folder / ROBOTS["G1"]).text)
         robot = spo.load(own, contacts=True, ground=spo.Plane())
-    yield from thrown(limp(robot), dt, 16, "limp", 0)
+    yield from throw(limp(robot), dt, 16, "limp", 0)
 
 
 CASES: dict[str, Callable] = {

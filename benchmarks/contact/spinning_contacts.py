@@ -38,7 +38,7 @@ XML = """<mujoco><option timestep="{h}" cone="elliptic" impratio="{ratio}" gravi
 
 
 class Case(NamedTuple):
-    """What a sphere does.
+    """The motion of a sphere on the ground.
 
     Attributes:
         spin, roll: coefficients, in radii. slope: of the ground. share: of the ratio of rolling friction that the slope

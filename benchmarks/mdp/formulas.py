@@ -21,7 +21,7 @@ FORCE = 1.0  # above which a foot touches [N]
 
 @dataclasses.dataclass
 class State:
-    """What a term may depend on, [world, ...], float64.
+    """Arguments of the formulas of terms, [world, ...], float64.
 
     Attributes:
         q, qd: coordinates and velocities. time: since the start of the episode [s]. action, last_action: of this step
@@ -257,7 +257,7 @@ def trot(touches: np.ndarray, one: tuple[int, int], other: tuple[int, int]) -> n
     return np.mean([a == b, c == d, a != c, b != d], axis=0)
 
 
-def turned(q: np.ndarray, most: float) -> dict[str, tuple[np.ndarray, float, float]]:
+def bound_turns(q: np.ndarray, most: float) -> dict[str, tuple[np.ndarray, float, float]]:
     """Return what is asked of the orientation of new starts: a turn about the vertical of at most ``most`` [rad]."""
     yaw = 2.0 * np.arctan2(q[:, 5], q[:, 6])
     return {"roll and pitch": (q[:, 3:5], 0.0, 0.0), "yaw": ((yaw + np.pi) % (2.0 * np.pi) - np.pi, -most, most)}

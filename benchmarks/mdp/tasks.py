@@ -6,14 +6,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from .formulas import Feet, Robot, State, heading, leans, moving, pushed, square, trot, turned
+from .formulas import Feet, Robot, State, bound_turns, heading, leans, moving, pushed, square, trot
 
 Rewards = dict[str, tuple[float, np.ndarray]]
 Observed = dict[str, list[tuple[str, np.ndarray, float]]]
 
 
 class Task:
-    """What a ready task says of each state.
+    """The formulas of a ready task, as its page gives them.
 
     Args:
         robot: of the task. worlds: how many. dt: length of a step [s].
@@ -158,7 +158,7 @@ class Ant(Task):
     def starts(self, q: np.ndarray, qd: np.ndarray) -> dict[str, tuple[np.ndarray, float, float]]:
         return {
             "place": (q[:, :3] - self.robot.stand[:3], 0.0, 0.0),
-            **turned(q, 0.2),
+            **bound_turns(q, 0.2),
             "joints": (q[:, 7:] - self.robot.default, -0.1, 0.1),
             "base's velocity": (qd[:, :6], 0.0, 0.0),
             "joints' velocity": (qd[:, 6:], -0.1, 0.1),
@@ -285,7 +285,7 @@ class Walking(Task):
         return {
             "x and y": (q[:, :2] - self.robot.stand[:2], -0.5, 0.5),
             "z": (q[:, 2] - self.robot.stand[2], 0.01, 0.05),
-            **turned(q, np.pi),
+            **bound_turns(q, np.pi),
             "joints": (q[:, 7:] - self.robot.default, -0.1, 0.1),
             "velocity": (qd, 0.0, 0.0),
         }

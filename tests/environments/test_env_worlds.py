@@ -1,4 +1,4 @@
-"""What terms read is what their world is: first observations, memories, periods, held commands, values of the world."""
+"""Values that terms read are those of their world: first observations, memories, periods, held commands, its values."""
 
 import itertools
 

@@ -41,7 +41,7 @@ def within(values: Any, limit: Any) -> Condition:
 
 
 class Check(NamedTuple):
-    """What the guard sees at one place.
+    """Numbers of one place that the guard looks at.
 
     Attributes:
         fine: whether all is within bounds. code: where it is not, the number that is counted, see :class:`Guard`.
@@ -63,7 +63,7 @@ def first(checks: Sequence[Check], name: str) -> Any:
 
 
 class Guard:
-    """What ends worlds, and what it is counted as.
+    """The checks that end worlds, and the names by which they are counted.
 
     Codes of causes: 1, 2, ... where numbers are not finite; as many more where they are finite and beyond bounds.
 

@@ -1,4 +1,4 @@
-"""What observations read of a step, in the state in which an episode starts: gaps, slips, controls and their forces.
+"""Reports of a step in the state in which an episode starts, for observations: gaps, slips, controls, their forces.
 
 No step has led to that state. Its contact points are where q puts them, and move as qd says; the controls are those of
 the action 0, which worlds remember then. Contacts have no force, and pairs of bodies do not slip. All of it is traced
