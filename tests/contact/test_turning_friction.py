@@ -196,7 +196,9 @@ def test_limbs_of_other_coefficients(dtype, device):
             moment = by_point(at, wanted.moment)[0]
             close = 1e-10 if dtype == "float64" else 1e-5
             np.testing.assert_allclose(found[world], wanted.v, atol=close * abs(wanted.v).max())
-            np.testing.assert_allclose(report.contact_moment[world], moment, atol=4 * close * abs(moment).max() + close)
+            # a moment that sticks is a secant of 1 / eps = 1e4 s/m: it loses a digit more than the rates
+            moments = close * (40 * abs(moment).max() + 1)
+            np.testing.assert_allclose(report.contact_moment[world], moment, atol=moments)
     if dtype == "float32":
         return
     names = ("contact_torsional_friction", "contact_rolling_friction")
