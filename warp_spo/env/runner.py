@@ -153,13 +153,21 @@ class Runner(OnPolicyRunner):
 
     def _configure_multi_gpu(self) -> None:
         size = int(os.environ.get("WORLD_SIZE", "1"))
-        if self.device != "cpu" or size == 1:
+        if size == 1:
             return super()._configure_multi_gpu()
         self.gpu_world_size, self.is_distributed = size, True
         self.gpu_global_rank, self.gpu_local_rank = (int(os.environ[name]) for name in ("RANK", "LOCAL_RANK"))
         ranks = {"global_rank": self.gpu_global_rank, "local_rank": self.gpu_local_rank}
         self.cfg["multi_gpu"] = ranks | {"world_size": size}
-        torch.distributed.init_process_group("gloo", rank=self.gpu_global_rank, world_size=size)
+        device = torch.device(self.device)
+        if device.type == "cuda":
+            torch.cuda.set_device(device)
+        # torchrun's store outlives a restart, and with it the addresses of processes that have ended (torch 2.13)
+        store = next(torch.distributed.rendezvous("env://", self.gpu_global_rank, size))[0]
+        store = torch.distributed.PrefixStore(f"start {os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
+        torch.distributed.init_process_group(
+            "nccl" if device.type == "cuda" else "gloo", store=store, rank=self.gpu_global_rank, world_size=size
+        )
 
 
 def load_checkpoint(runner: OnPolicyRunner, file: str | Path, learns: bool = True) -> int:
