@@ -4,13 +4,25 @@ import functools
 
 import warp as wp
 
+from .long_results import WARP_SIZE
 from .status import NORMAL, NOT_FINITE, PIVOT, QUATERNION, RANGE
 
+LANES = WARP_SIZE  # that share a world on a GPU; one does all elsewhere
 LOOPS = 6  # as warp_spo.Status, which kernels cannot import; a test compares
 ANGLE, ROTATION = 1, 2  # kinds of coordinates: an angle, and the first of four that are a quaternion
 FARTHEST = 1e10  # [rad]; beyond, full turns are subtracted with an error above 1e-6 rad
 SQUARES = {wp.float32: (1e-30, 1e38), wp.float64: (1e-290, 1e307)}
 """Between these lies the sum of squares of a quaternion that is normalised as it should be."""
+BAD, BAD_RANGE, BAD_QUATERNION = 1, 2, 4  # bits of what a lane finds
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int step = lanes / 2; step; step /= 2) x |= __shfl_xor_sync(0xffffffffu, x, step);
+#endif
+    return x;
+""")
+def any_lane(x: int, lanes: int) -> int: ...
 
 
 @functools.cache
@@ -24,40 +36,41 @@ def check_results(T: type) -> wp.Kernel:
     tiny, least, most = T(NORMAL[T][0]), *(T(x) for x in SQUARES[T])
 
     @wp.func
-    def finite_row(array: wp.array2d[T], world: int):
-        fine = bool(True)
+    def bad_of_row(array: wp.array2d[T], world: int, lane: int, lanes: int):
+        bad = int(0)
         if array:
-            for i in range(array.shape[1]):
-                fine = fine and wp.isfinite(array[world, i])
-        return fine
+            for i in range(lane, array.shape[1], lanes):
+                bad |= wp.where(wp.isfinite(array[world, i]), 0, wp.static(BAD))
+        return bad
 
     @wp.func
-    def finite_rows(array: wp.array3d[T], world: int):
-        fine = bool(True)
+    def bad_of_rows(array: wp.array3d[T], world: int, lane: int, lanes: int):
+        bad = int(0)
         if array:
-            for i in range(array.shape[1]):
-                for c in range(array.shape[2]):
-                    fine = fine and wp.isfinite(array[world, i, c])
-        return fine
+            width = array.shape[2]
+            for i in range(lane, array.shape[1] * width, lanes):
+                bad |= wp.where(wp.isfinite(array[world, i // width, i % width]), 0, wp.static(BAD))
+        return bad
 
     @wp.func
-    def word_of(q: wp.array2d[T], kinds: wp.array[wp.int32], world: int):
-        found = int(0)
-        for i in range(kinds.shape[0]):
+    def bad_of_state(q: wp.array2d[T], kinds: wp.array[wp.int32], world: int, lane: int, lanes: int):
+        bad = int(0)
+        for i in range(lane, kinds.shape[0], lanes):
             if kinds[i] == wp.static(ANGLE) and wp.abs(q[world, i]) > T(wp.static(FARTHEST)):
-                found = wp.max(found, RANGE)
+                bad |= wp.static(BAD_RANGE)
             if kinds[i] == wp.static(ROTATION):
                 square = T(0.0)
                 for c in range(4):
                     square += q[world, i + c] * q[world, i + c]
                 if square < tiny:
-                    found = QUATERNION
+                    bad |= wp.static(BAD_QUATERNION)
                 elif square < least or square > most:
-                    found = wp.max(found, RANGE)
-        return found
+                    bad |= wp.static(BAD_RANGE)
+        return bad
 
     @wp.kernel(module=f"warp_spo_result_check_{T.__name__}", enable_backward=False)
     def kernel(
+        lanes: int,
         q: wp.array2d[T],
         kinds: wp.array[wp.int32],
         word: int,
@@ -73,21 +86,26 @@ def check_results(T: type) -> wp.Kernel:
         velocities: wp.array3d[T],
         status_out: wp.array[wp.int32],
     ):
-        world = wp.tid()
-        known, asked = status_out[world], word_of(q, kinds, world)
-        if asked == QUATERNION or (asked == RANGE and known != NOT_FINITE):
-            status_out[world] = asked
-        elif known != NOT_FINITE and known != PIVOT and known != RANGE and known != wp.static(LOOPS):
-            fine = finite_row(q_after, world) and finite_row(rates, world) and finite_row(qdd, world)
-            fine = fine and finite_row(slip, world) and finite_row(excess, world)
-            fine = fine and finite_rows(force, world)
-            fine = fine and finite_rows(poses, world) and finite_rows(velocities, world)
-            if residual:
-                fine = fine and wp.isfinite(residual[world])
-            if gap:
-                for i in range(gap.shape[1]):
-                    fine = fine and not wp.isnan(gap[world, i])
-            if not fine:
+        world, lane = wp.tid() // lanes, wp.tid() % lanes
+        bad = bad_of_state(q, kinds, world, lane, lanes)
+        bad |= bad_of_row(q_after, world, lane, lanes) | bad_of_row(rates, world, lane, lanes)
+        bad |= bad_of_row(qdd, world, lane, lanes) | bad_of_row(slip, world, lane, lanes)
+        bad |= bad_of_row(excess, world, lane, lanes) | bad_of_rows(force, world, lane, lanes)
+        bad |= bad_of_rows(poses, world, lane, lanes) | bad_of_rows(velocities, world, lane, lanes)
+        if residual:
+            bad |= wp.where(wp.isfinite(residual[world]), 0, wp.static(BAD))
+        if gap:
+            for i in range(lane, gap.shape[1], lanes):
+                bad |= wp.where(wp.isnan(gap[world, i]), wp.static(BAD), 0)
+        bad = any_lane(bad, lanes)
+        if lane == 0 and bad != 0:
+            known = status_out[world]
+            if bad & wp.static(BAD_QUATERNION):
+                status_out[world] = QUATERNION
+            elif bad & wp.static(BAD_RANGE):
+                if known != NOT_FINITE:
+                    status_out[world] = RANGE
+            elif known != NOT_FINITE and known != PIVOT and known != RANGE and known != wp.static(LOOPS):
                 status_out[world] = word
 
     return kernel

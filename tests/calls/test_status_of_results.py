@@ -58,14 +58,18 @@ def test_quaternions_whose_squares_leave_the_dtype_have_a_word(device):
 
 @pytest.mark.parametrize("substeps", [1, 2])
 def test_contact_forces_that_are_not_finite_have_a_word(substeps, device):
-    """Of pairs, one body 1e25 m away in the second of two worlds; the first is as it would be alone."""
+    """Of pairs, one body 1e25 m away in the second of two worlds; the first is as it would be alone.
+
+    On a GPU, which fuses products and sums, that world's results may be finite (they were on an H100).
+    """
     scene, (q, qd) = pair_scenes.shelf(-1), map(np.float32, pair_scenes.shelf_states(0, 2))
     q[1, 7] = 1e25
     dyn = spo.Dynamics(scene, 2, device=device, dtype="float32")
     status, report = words(2), dyn.step_report("contact_f", "contact_slip", like=q)
     found = dyn.step(q, qd, None, 1e-3, status=status, report=report, options=spo.StepOptions(substeps=substeps))
     fine = [all(np.isfinite(x[world]).all() for x in (*found, report.contact_f)) for world in range(2)]
-    assert fine == [True, False] and status[0] != spo.Status.RANGE and status[1] != 0
+    assert fine[0] and status[0] != spo.Status.RANGE and (fine[1] or status[1] != 0)
+    assert str(device).startswith("cuda") or not fine[1]
 
 
 @pytest.mark.parametrize("left", [1.0, 1e-2, 1e-4])

@@ -157,7 +157,7 @@ def cubes():
 
 @pytest.mark.slow
 def test_bodies_that_touch_each_other_are_seen_and_changed():
-    """Contact arrays have a row for each pair after those of points (four of a box), and events change their friction, too."""
+    """Contact arrays have a row for each pair after those of points, four a box; events change their friction, too."""
     options = dict(
         decimation=1, default_q=[0.0, 0.0, 0.0, 0.0995, 0.0, 0.0, 0.0, 1.0],
         actions=actions.Effort("slide", scale=10.0), rewards={"none": (1.0, lambda w: 0.0)},

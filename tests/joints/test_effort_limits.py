@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from torch.autograd import gradcheck
 
 import warp_spo as spo
@@ -150,9 +151,10 @@ def test_a_clipped_force_has_derivative_zero(device):
     """By controls and state; by the limit it is h / m. Others are those of differences."""
     scene = set_limit(slider(spo.Actuator(0, gear=2.0), spo.Actuator(0, gain=5.0, bias=(0, 0, -5.0))), 6.0)
     dyn = spo.Dynamics(scene, 2, device=device, dtype="float64", variable=("joint_effort_limit",))
-    q, qd = (torch.full((2, 1), x, dtype=torch.float64, requires_grad=True) for x in (0.1, 0.3))
-    ctrl = torch.tensor([[1.0, 0.2], [4.0, 1.0]], dtype=torch.float64, requires_grad=True)
-    limit = torch.full((2, 1), 6.0, dtype=torch.float64, requires_grad=True)
+    on = dict(dtype=torch.float64, requires_grad=True, device=wp.device_to_torch(device))
+    q, qd = (torch.full((2, 1), x, **on) for x in (0.1, 0.3))
+    ctrl = torch.tensor([[1.0, 0.2], [4.0, 1.0]], **on)
+    limit = torch.full((2, 1), 6.0, **on)
 
     def stepped(q, qd, ctrl, limit):
         dyn.set(joint_effort_limit=limit)
@@ -166,7 +168,7 @@ def test_a_clipped_force_has_derivative_zero(device):
         assert gradcheck(run, (q, qd, ctrl, limit), atol=1e-9)
         by_ctrl, by_limit = torch.autograd.grad(run(q, qd, ctrl, limit).sum(), (ctrl, limit))
         assert (by_ctrl[0] != 0.0).all() and (by_ctrl[1] == 0.0).all()
-        np.testing.assert_allclose(by_limit.ravel(), [0.0, slope], atol=EXACT)
+        np.testing.assert_allclose(by_limit.cpu().ravel(), [0.0, slope], atol=EXACT)
 
 
 def test_motors_along_a_curve_obey(device):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 import warp_spo as spo
 from support import laws, zoo
@@ -85,13 +86,14 @@ def test_gradients_know_how_it_is_carried(device):
         after, rates = dyn.step(q[None], given["qd"], given["tau"], DT)
         return after @ weight[0] + rates @ weight[1, : scene.dof_count]
 
-    given = {name: torch.tensor(array, requires_grad=True) for name, array in state.items()}
-    after, rates = dyn.step(torch.tensor(q[None]), given["qd"], given["tau"], DT)
-    (after @ torch.tensor(weight[0]) + rates @ torch.tensor(weight[1, : scene.dof_count])).sum().backward()
+    on = dict(device=wp.device_to_torch(device))
+    given = {name: torch.tensor(array, requires_grad=True, **on) for name, array in state.items()}
+    after, rates = dyn.step(torch.tensor(q[None], **on), given["qd"], given["tau"], DT)
+    (after @ torch.tensor(weight[0], **on) + rates @ torch.tensor(weight[1, : scene.dof_count], **on)).sum().backward()
     for name, array in state.items():
         along, h = rng.normal(size=array.shape), 1e-5
         slope = (value(**{**state, name: array + h * along}) - value(**{**state, name: array - h * along})) / (2.0 * h)
-        assert laws.error((given[name].grad.numpy() * along).sum(), slope[0]) <= 1e-8
+        assert laws.error((given[name].grad.cpu().numpy() * along).sum(), slope[0]) <= 1e-8
 
 
 @pytest.mark.parametrize("variable", [(), ("joint_stiffness", "joint_damping")], ids=["constant", "variable"])

@@ -86,7 +86,9 @@ def check_results(
     """
     declare(result_check, run.dtype)
     names = ("q_after", "rates", "qdd", "slip", "excess", "residual", "gap", "force", "poses", "velocities")
-    run.launch(result_check.check_results, run.worlds, [q, kinds, word, *map(written.get, names)], [status])
+    lanes = result_check.LANES if run.device.is_cuda and run.worlds * result_check.LANES < 2**31 else 1
+    inputs = [lanes, q, kinds, word, *map(written.get, names)]
+    run.launch(result_check.check_results, run.worlds * lanes, inputs, [status])
 
 
 def kinds_of_coordinates(scene: Scene) -> np.ndarray:
