@@ -260,20 +260,37 @@ def replay_failure(self: Env, file: str | Path) -> ReplayedFailure:
 def make_alone(env: Env, failure: Failure) -> Env:
     """Return an environment with the arguments of another one for the world of a failure alone.
 
-    Where the scene has values for each world they stay numbers that differ: there are two worlds of the same values.
+    Where the scene has values for each world, other worlds stand beside it, see :func:`rows_beside`. Terms in torch,
+    which may know the number of worlds, are not called.
     """
+    from .environment import Env as Whole
+
+    alone = type("EnvOfFailure", (Whole,), {"_fill_in": lambda *_: None})
     scene, row = env.scene, failure.world - env.first_world
-    rows = [0] if scene.worlds == 1 else [row, row]
     if scene.worlds > 1 and not 0 <= row < scene.worlds:
         raise ValueError(
             f"Env.replay_failure: the failure is of world {failure.world}, the scene has values for {scene.worlds} "
             "worlds; expected the scene of the environment that left the file"
         )
+    rows = [0] if scene.worlds == 1 else rows_beside(scene, row)
     own = {
         "scene": scene_of_rows(scene, rows), "worlds": len(rows), "first_world": failure.world, "seed": failure.seed,
         "graph": False, "keep_failures": None,
     }  # fmt: skip
-    return type(env)(**(env._given | own))
+    return alone(**(env._given | own))
+
+
+def rows_beside(scene: Scene, row: int) -> list[int]:
+    """Return a world and others, such that what differs between the worlds of a scene differs between these, too.
+
+    A number that all worlds share is a constant of the kernels, and would have other bits.
+    """
+    every = np.concatenate([x.reshape(scene.worlds, -1) for x in scene.values.values() if len(x) > 1], axis=1)
+    rows, left = [row], (every != every[row]).any(axis=0)
+    while left.any():
+        rows.append(int((every != every[row])[:, left.argmax()].argmax()))
+        left &= every[rows[-1]] == every[row]
+    return rows if len(rows) > 1 else [row, row]
 
 
 class _Replay:
