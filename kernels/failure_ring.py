@@ -70,7 +70,8 @@ def mark_worlds() -> wp.Kernel:
     Causes are faults, which count from 1, and then the words of ``status`` that ``counts`` says.
 
     ``most``: files of a cause. ``taken``: files that causes have. ``until``: the step from which a world may have
-    another file. ``first``: of each cause, the world found, or ``NOBODY``; ``found`` [1]: whether there is one.
+    another file of the cause ``latest``. ``first``: of each cause, the world found, or ``NOBODY``. ``found`` [1]:
+    whether there is one.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)
@@ -82,6 +83,7 @@ def mark_worlds() -> wp.Kernel:
         most: int,
         taken: wp.array[int],
         until: wp.array[int],
+        latest: wp.array[int],
         clock: wp.array[int],
         first: wp.array[int],
         found: wp.array[int],
@@ -93,7 +95,7 @@ def mark_worlds() -> wp.Kernel:
         elif counts[status[world]] > 0:
             cause = faults + status[world]
         if cause >= 0:
-            if taken[cause] < most and until[world] <= clock[0]:
+            if taken[cause] < most and (until[world] <= clock[0] or latest[world] != cause):
                 wp.atomic_min(first, cause, world)
                 found[0] = 1
 
@@ -115,6 +117,7 @@ def choose_worlds() -> wp.Kernel:
         status: wp.array[int],
         taken: wp.array[int],
         until: wp.array[int],
+        latest: wp.array[int],
         clock: wp.array[int],
         files: wp.array[int],
         chosen: wp.array2d[int],
@@ -135,6 +138,7 @@ def choose_worlds() -> wp.Kernel:
                         chosen[row, STATUS] = status[world]
                         taken[cause] = taken[cause] + 1
                         until[world] = now + slots
+                        latest[world] = cause
                         row += 1
             files[1] = row
         clock[0] = now + 1

@@ -181,6 +181,22 @@ def test_files_have_a_limit_and_episodes_before_a_seed_do_not_count(tmp_path):
     assert replayed.equal and replayed.cause == found.cause == "not finite/state/coordinates"
 
 
+def test_a_world_may_have_files_of_two_causes(tmp_path):
+    """Within fewer steps than the ring has: a contact out of its law does not hide what ends the world."""
+    env = hopper_env(3, keep=tmp_path)
+    for i in range(6):
+        if i in (1, 3):
+            env.q[1, 0], env.qd[1, 0] = 0.06, -40.0
+        env.step(torch.full((3, 1), math.nan if i == 4 else 0.0))
+    causes = [(each.world, each.step, each.cause) for each in map(read, env.failure_files())]
+    assert causes[0] == (1, 1, "status CONTACT") and (0, 4, "not finite/action") in causes
+    env.reset()
+    given = torch.zeros(3, 1)
+    given[1] = math.nan
+    env.step(given)
+    assert [(each.world, each.cause) for each in map(read, env.failure_files())][-1] == (1, "not finite/action")
+
+
 def test_a_scene_with_values_for_each_world_and_a_run_on_several_devices(tmp_path):
     """World 2 of the second device, with its own mass."""
     scene = cart_env(1).scene.with_values(body_mass=[[1.0, 0.1 + 0.1 * i] for i in range(4)])

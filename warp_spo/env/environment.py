@@ -121,6 +121,7 @@ class Env(VecEnv):
         keep_failures: str | Path | None = None,
     ):
         self._given = {name: value for name, value in locals().items() if name != "self"}
+        self._alone: dict[tuple[int, ...], Env] = {}  # of one world, for replays of failures
         self.scene, self.num_envs = arguments.checked_scene(scene), worlds
         self.warp_device = parse_device(str(device) if device is not None else None, "Env")
         self.device = torch.device(wp.device_to_torch(self.warp_device))

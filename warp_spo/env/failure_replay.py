@@ -263,21 +263,24 @@ def make_alone(env: Env, failure: Failure) -> Env:
     Where the scene has values for each world, other worlds stand beside it, see :func:`rows_beside`. Terms in torch,
     which may know the number of worlds, are not called.
     """
-    from .environment import Env as Whole
-
-    alone = type("EnvOfFailure", (Whole,), {"_fill_in": lambda *_: None})
     scene, row = env.scene, failure.world - env.first_world
     if scene.worlds > 1 and not 0 <= row < scene.worlds:
         raise ValueError(
             f"Env.replay_failure: the failure is of world {failure.world}, the scene has values for {scene.worlds} "
             "worlds; expected the scene of the environment that left the file"
         )
+    from .environment import Env as Whole
+
     rows = [0] if scene.worlds == 1 else rows_beside(scene, row)
-    own = {
-        "scene": scene_of_rows(scene, rows), "worlds": len(rows), "first_world": failure.world, "seed": failure.seed,
-        "graph": False, "keep_failures": None,
-    }  # fmt: skip
-    return alone(**(env._given | own))
+    if tuple(rows) not in env._alone:
+        env._alone.clear()
+        kind = type("EnvOfFailure", (Whole,), {"_fill_in": lambda *_: None})
+        own = {"scene": scene_of_rows(scene, rows), "worlds": len(rows), "graph": False, "keep_failures": None}
+        env._alone[tuple(rows)] = kind(**(env._given | own))
+    alone = env._alone[tuple(rows)]
+    alone.first_world = failure.world
+    alone.reset(seed=failure.seed)
+    return alone
 
 
 def rows_beside(scene: Scene, row: int) -> list[int]:

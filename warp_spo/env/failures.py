@@ -148,15 +148,17 @@ class FailureRing:
         self._clock, self._until = zeros(1), zeros(worlds)
         own = dict(
             counts=torch.tensor(counted, dtype=torch.int32, device=self._device), taken=zeros(kinds), found=zeros(1),
-            first=zeros(kinds), status=self.status, until=self._until, clock=self._clock,
+            first=zeros(kinds), status=self.status, until=self._until, latest=zeros(worlds), clock=self._clock,
             files=self._count, chosen=self._chosen, rows=self._rows, fault=self._fault,
         )  # fmt: skip
         self._own = own
         self._wp = {name: wp.from_torch(tensor) for name, tensor in own.items()}
         self._wp["place"] = wp.array(np.concatenate(places), dtype=wp.int64, device=self._wp_device)
         self._wp["pitch"] = wp.array(np.concatenate(pitches), dtype=wp.int32, device=self._wp_device)
-        self._seen = torch.zeros(2, dtype=torch.int32, pin_memory=True) if self._device.type == "cuda" else self._count
+        pinned = self._device.type == "cuda"
+        self._seen = torch.zeros(2, dtype=torch.int32, pin_memory=True) if pinned else self._count
         self._seen_files = self._seen.numpy()
+        self._host = [torch.empty_like(x[0], device="cpu", pin_memory=pinned) for x in (self._rows, self._chosen)]
         self.bytes = sum(x.nbytes for x in (self._ring, self._rows, self._until, self.status))
         self._chunks = [
             self._cut([name for name in self._arrays if (name == JUDGED) == late]) for late in (False, True)
@@ -199,10 +201,10 @@ class FailureRing:
     def find(self) -> None:
         """Find worlds that have failed in this step, and copy their rings aside."""
         own, worlds = self._wp, len(self.status)
-        marked = [own[name] for name in ("taken", "until", "clock", "first", "found")]
+        marked = [own[name] for name in ("taken", "until", "latest", "clock", "first", "found")]
         given = [own["fault"], own["status"], own["counts"], len(self._guard), FILES_OF_A_CAUSE]
         self._launch(kernels.mark_worlds(), worlds, given, marked)
-        names = ("first", "found", "status", "taken", "until", "clock", "files", "chosen")
+        names = ("first", "found", "status", "taken", "until", "latest", "clock", "files", "chosen")
         self._launch(kernels.choose_worlds(), 1, [SLOTS], [own[name] for name in names])
         inputs = [SLOTS, self._words, self._ring.data_ptr(), *(own[n] for n in ("place", "pitch", "files", "chosen"))]
         self._launch(kernels.copy_rings(), tuple(self._rows.shape[1:]), inputs, [own["rows"]])
@@ -292,10 +294,16 @@ class FailureRing:
 
     def _fetch(self, row: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the ring of a row and what was chosen, on the host; on CUDA by a stream of this thread's own."""
+        given = self._rows[row], self._chosen[row]
         if self._device.type != "cuda":
-            return self._rows[row].clone(), self._chosen[row].clone()
+            return given[0].clone(), given[1].clone()
         with torch.cuda.device(self._device), torch.cuda.stream(torch.cuda.Stream(self._device)):
-            return self._rows[row].cpu(), self._chosen[row].cpu()
+            for host, each in zip(self._host, given, strict=True):
+                host.copy_(each, non_blocking=True)
+            event = torch.cuda.Event()
+            event.record()
+            event.synchronize()  # this thread alone waits
+        return self._host[0].clone(), self._host[1].clone()
 
     def _pickled_scene(self, world: int) -> torch.Tensor | str:
         """Return the scene with the values that a world was given, pickled; in words why it cannot be."""
