@@ -12,6 +12,7 @@ torch = pytest.importorskip("torch")
 import warp_spo as spo  # noqa: E402
 from support.env_scenes import cart_env, walker_env  # noqa: E402
 from warp_spo import env as environments  # noqa: E402
+from warp_spo import train as command  # noqa: E402
 from warp_spo.env import Env, Observation, TorchTerm, actions, commands, events, failures, training_files  # noqa: E402
 from warp_spo.env.failure_replay import read  # noqa: E402
 from warp_spo.env.learning import Learner, train  # noqa: E402
@@ -275,6 +276,19 @@ def test_a_training_with_a_failure_goes_on(tmp_path):
     files = env.failure_files()
     assert files and read(files[0]).cause == "not finite/observation/actor/term 1"
     assert env.replay_failure(files[-1]).equal
+
+
+def test_the_command_keeps_failures(tmp_path, capsys):
+    given = ["cartpole", "--worlds", "4", "--device", "cpu", "--iterations", "1", "--set", "learner.hidden=(8,)",
+             "--set", "learner.steps=4", "--logger", "none"]  # fmt: skip
+    assert command.main([*given, "--out", str(tmp_path / "run"), "--keep-failures"]) == 0
+    said = capsys.readouterr().out
+    assert "failures: the last 50 steps, " in said and f"in '{tmp_path}/run/failures'" in said
+    assert list((tmp_path / "run" / "failures").iterdir()) == []
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SystemExit):
+        command.main([*given, "--out", str(tmp_path / "other"), "--keep-failures", str(tmp_path / "file")])
+    assert "where no file can be written (File exists)" in capsys.readouterr().err
 
 
 @pytest.mark.slow
