@@ -128,6 +128,16 @@ def test_a_state_that_steps_do_not_lead_to_is_told(run, tmp_path):
         assert not replayed.equal and (first + 20, (name,)) in replayed.differences, name
 
 
+def test_a_plan_that_many_worlds_have_and_one_has_not(run, tmp_path):
+    """The world is stepped among as many as in the run: its last bits may depend on the granularity."""
+    env, files, _ = run
+    alone = hopper_env(1, device=env.warp_device)
+    torch.save(torch.load(files[POLICY[0]], weights_only=True) | {"plan": ["other", 0, False]}, tmp_path / "other.pt")
+    for file, worlds in ((files[POLICY[0]], 1), (tmp_path / "other.pt", WORLDS)):
+        assert alone.replay_failure(file).equal
+        assert [each.num_envs for each in alone._alone.values()] == [worlds]
+
+
 def test_words_on_a_failure(run):
     env, files, _ = run
     lines = read(files[POLICY[0]]).describe().splitlines()

@@ -15,13 +15,14 @@ import torch
 from ..errors import shown
 from ..scene.scene import Scene
 from ..status import Status
-from .failures import ACTIONS, FORCE, FORMAT, JUDGED, STATUS, USER, scene_of_rows, state_arrays
+from .failures import ACTIONS, FORCE, FORMAT, JUDGED, STATUS, USER, plan_of, scene_of_rows, state_arrays
 
 if TYPE_CHECKING:
     from .environment import Env
 
 KEYS = {
     "cause", "world", "worlds", "seed", "step", "arrays", "scene", "memory", "labels", "dt", "decimation", "device",
+    "plan",
 }  # fmt: skip
 LEFT_OUT = ("found", "tick", "episode_length", STATUS, FORCE)  # where no number of the user's goes wrong
 
@@ -40,7 +41,8 @@ class Failure:
         contact_f: forces of contacts in the step before each of the steps [step, contact, 3] [N], None where no term
             of the environment reads them.
         lengths: steps since the start of the episode, before each step [step].
-        dt, decimation: of the environment. device: that it ran on.
+        dt, decimation: of the environment. device: that it ran on. plan: granularity and length of blocks of the
+            dynamics, and whether worlds were few.
         arrays: all that decides how the world goes on, before each step, by name [step, ...].
         memory: (start, size) in ``arrays["memory"]`` of what worlds remember, by name. labels: of entries of actions,
             q and qd.
@@ -54,6 +56,7 @@ class Failure:
     dt: float
     decimation: int
     device: str
+    plan: list[Any]
     arrays: Mapping[str, torch.Tensor]
     memory: Mapping[str, tuple[int, int]]
     labels: Mapping[str, list[str]]
@@ -260,8 +263,9 @@ def replay_failure(self: Env, file: str | Path) -> ReplayedFailure:
 def make_alone(env: Env, failure: Failure) -> Env:
     """Return an environment with the arguments of another one for the world of a failure alone.
 
-    Where the scene has values for each world, other worlds stand beside it, see :func:`rows_beside`. Terms in torch,
-    which may know the number of worlds, are not called.
+    Where the scene has values for each world, other worlds stand beside it, see :func:`rows_beside`. Where the plan of
+    the dynamics has another granularity for so few worlds, there are as many as in the run, and the first one counts:
+    last bits may depend on it. Terms in torch, which may know the number of worlds, are not called.
     """
     scene, row = env.scene, failure.world - env.first_world
     if scene.worlds > 1 and not 0 <= row < scene.worlds:
@@ -269,18 +273,24 @@ def make_alone(env: Env, failure: Failure) -> Env:
             f"Env.replay_failure: the failure is of world {failure.world}, the scene has values for {scene.worlds} "
             "worlds; expected the scene of the environment that left the file"
         )
-    from .environment import Env as Whole
-
-    rows = [0] if scene.worlds == 1 else rows_beside(scene, row)
-    if tuple(rows) not in env._alone:
-        env._alone.clear()
-        kind = type("EnvOfFailure", (Whole,), {"_fill_in": lambda *_: None})
-        own = {"scene": scene_of_rows(scene, rows), "worlds": len(rows), "graph": False, "keep_failures": None}
-        env._alone[tuple(rows)] = kind(**(env._given | own))
-    alone = env._alone[tuple(rows)]
+    alone = _make(env, [0] if scene.worlds == 1 else rows_beside(scene, row))
+    if plan_of(alone) != failure.plan:
+        alone = _make(env, [(max(row, 0) + i) % scene.worlds for i in range(failure.worlds)])
     alone.first_world = failure.world
     alone.reset(seed=failure.seed)
     return alone
+
+
+def _make(env: Env, rows: list[int]) -> Env:
+    """Return an environment of so many worlds, with the values that ``rows`` have in the scene; it is kept."""
+    from .environment import Env as Whole
+
+    key = tuple(rows)
+    if key not in env._alone:
+        kind = type("EnvOfFailure", (Whole,), {"_fill_in": lambda *_: None})
+        own = {"scene": scene_of_rows(env.scene, rows), "worlds": len(rows), "graph": False, "keep_failures": None}
+        env._alone = {key: kind(**(env._given | own))}
+    return env._alone[key]
 
 
 def rows_beside(scene: Scene, row: int) -> list[int]:

@@ -329,9 +329,16 @@ def facts(env: Env) -> dict[str, Any]:
     return {
         "format": FORMAT, "what": "failure of a world", "versions": training_files.versions(),
         "worlds": env.num_envs, "device": str(env.warp_device), "dt": env.dt, "decimation": env.decimation,
+        "plan": plan_of(env),
         "memory": {name: [start, size] for name, (start, size, _) in env._layout.memory.items()},
         "labels": {"actions": env.action_labels, "q": coordinates, "qd": list(scene.dof_labels)},
     }  # fmt: skip
+
+
+def plan_of(env: Env) -> list[Any]:
+    """Return what the plan chooses by the number of worlds, and what last bits depend on."""
+    plan = env.dyn.plan
+    return [plan.granularity, plan.block_length, plan.device.cuda and plan.latency_bound]
 
 
 def scene_of_rows(scene: Scene, rows: list[int]) -> Scene:
