@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 import pickle
 import warnings
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -220,6 +221,7 @@ class FailureRing:
         for name in ("taken", "found", "until", "clock", "files"):
             self._own[name].zero_()
         self._own["first"].fill_(kernels.NOBODY)
+        self._seen.zero_()
 
     # -- on the host -----------------------------------------------------------------------------------------------
     def look(self) -> None:
@@ -363,7 +365,7 @@ def checked_folder(folder: Any) -> Path:
     if not isinstance(folder, str | Path) or not str(folder):
         raise TypeError(f"Env: keep_failures is {folder!r}; expected a folder, such as 'failures', or None")
     path = Path(folder)
-    probe = path / ".probe"
+    probe = path / f".probe-{os.getpid()}"  # processes of a training share the folder
     try:
         path.mkdir(parents=True, exist_ok=True)
         training_files.write_bytes(probe, bytes(1 << 16))
