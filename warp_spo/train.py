@@ -6,6 +6,7 @@ python -m warp_spo.train go2-flat                         # into runs/go2-flat
 python -m warp_spo.train go2-flat --resume latest         # go on where it was stopped, by Ctrl-C or a crash
 python -m warp_spo.train go2-flat --resume runs/go2-flat/model_399.pt --iterations 800
 python -m warp_spo.train my_task.py --set learner.entropy=0.01 --set rewards.velocity=3 --set episode_length_s=10
+python -m warp_spo.train go2-flat --keep-failures         # worlds that fail leave files in runs/go2-flat/failures
 python -m warp_spo.train go2-flat --gpus 4                # one process a GPU, each with --worlds worlds
 python -m warp_spo.train cartpole --gpus 2 --device cpu   # two processes on the CPU
 
@@ -63,6 +64,10 @@ def start(given: list[str]) -> int:
         "--logger", action="append", choices=("tensorboard", "wandb", "none"), dest="loggers",
         help="beside progress.jsonl; left out: tensorboard where it is installed; may be repeated",
     )  # fmt: skip
+    parser.add_argument(
+        "--keep-failures", nargs="?", const="", metavar="FOLDER", dest="failures",
+        help="worlds that fail leave files there, to be replayed; without FOLDER: failures, in the folder of --out",
+    )  # fmt: skip
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes", help=SET)
     parser.add_argument("--settings", type=Path, metavar="FILE.toml", help="such settings in a file")
     options = parser.parse_args(given)
@@ -110,8 +115,11 @@ def learn(parser: Any, options: argparse.Namespace, chosen: Any, learner: Any, g
     name = short_name(options.task)
     try:
         device = learning.pick_device(options.device)
-        env = build(chosen, worlds, device, options.seed, options.given, first_world=rank * worlds)
+        kept = {} if options.failures is None else {"keep_failures": options.failures or folder / "failures"}
+        env = build(chosen, worlds, device, options.seed, options.given, first_world=rank * worlds, **kept)
         print(f"{name}: {worlds} worlds on {device}, {time.time() - BEGAN:.1f} s", flush=True)
+        if kept and rank == 0:
+            print(f"failures: {env._failures.describe()}", flush=True)
         runner, iterations = learning.prepare(
             env, learner, folder, options.iterations, options.resume, options.seed + rank, options.save_interval,
             began=BEGAN, seconds=options.seconds, loggers=loggers,
@@ -124,6 +132,8 @@ def learn(parser: Any, options: argparse.Namespace, chosen: Any, learner: Any, g
     except (ValueError, OSError, ImportError) as error:
         parser.error(str(error))
     ending = learning.run(runner, iterations)
+    for file in env.failure_files():
+        print(f"{file}: {describe_failure(file)}", flush=True)
     if rank == 0:
         try:
             print(f"{folder}: checkpoints, progress.jsonl, {draw_curve(folder, name).name}")
@@ -135,6 +145,16 @@ def learn(parser: Any, options: argparse.Namespace, chosen: Any, learner: Any, g
             print(f"{folder}: {learning.describe_end(ending)}{again}", flush=True)
     learning.leave()
     return ending.status
+
+
+def describe_failure(file: Path) -> str:
+    """Return the first line on the failure in a file."""
+    from .env.failure_replay import read
+
+    try:
+        return read(file).describe().splitlines()[0]
+    except (OSError, ValueError) as error:
+        return str(error)
 
 
 def continuation(given: list[str]) -> str:

@@ -98,6 +98,8 @@ def load_state_dict(self: Env, state: Mapping[str, torch.Tensor]) -> None:
     low, high = (int(word) & 0xFFFFFFFF for word in state["key"][:2])
     self.seed = low | high << 32
     self._set_values()
+    if self._failures is not None:
+        self._failures.restart(self.seed, self._steps)
 
 
 def copy_worlds(env: Env, worlds: torch.Tensor) -> dict[str, torch.Tensor]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from ..runtime.arrays import parse_device
 from ..runtime.launches import compile_side_by_side
 from ..runtime.torch_tensors import stream
 from ..scene.scene import Scene
-from . import arguments, checkpoint, seeding
+from . import arguments, checkpoint, failure_replay, seeding
 from .bounds import Bounds
 from .commands import COMMAND, HELD
 from .compile.buffers import Storage
@@ -30,6 +31,7 @@ from .compile.memory_layout import MemoryLayout
 from .compile.step_kernels import Tracing
 from .episode_log import Log, describe, explain
 from .events import Delays, Values, changed_values
+from .failures import FailureRing
 from .held_tensor import HeldTensor
 from .observations import TorchTerm
 from .validation import check_whole
@@ -73,6 +75,8 @@ class Env(VecEnv):
             new starts, the last observation of worlds whose episode has ended.
         bounds: sizes of actions, states, observations and rewards that end a world; None: those of ``Bounds``.
         log_interval: steps after which ``extras["log"]`` comes again.
+        keep_failures: None, or a folder: a world that fails leaves a file there, from which :meth:`replay_failure`
+            steps it again. It fails where the guard ends it, or where a step's status is CONTACT or a more severe one.
 
     Attributes:
         q, qd: state, torch tensors [world, coordinate] and [world, dof].
@@ -114,7 +118,10 @@ class Env(VecEnv):
         final_observations: bool = False,
         bounds: Bounds | None = None,
         cfg: Any = None,
+        keep_failures: str | Path | None = None,
     ):
+        self._given = {name: value for name, value in locals().items() if name != "self"}
+        self._alone: dict[tuple[int, ...], Env] = {}  # of one world, for replays of failures
         self.scene, self.num_envs = arguments.checked_scene(scene), worlds
         self.warp_device = parse_device(str(device) if device is not None else None, "Env")
         self.device = torch.device(wp.device_to_torch(self.warp_device))
@@ -130,6 +137,7 @@ class Env(VecEnv):
         self.bounds = arguments.checked_bounds(bounds)
         guard = Guard(self.bounds.limits(scene, self.dt, episode_length_s, list(terms[1]), terms[0]))
         self._layout = MemoryLayout(scene, default, self.step_dt, commands, changed_values(scene, events), guard)
+        self._layout.keeps_failures = keep_failures is not None
         tracing = self._trace(arguments.checked_parts(actions), *terms, commands, events)
         variable = self._layout.values
         self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=variable, granularity=granularity)
@@ -144,6 +152,9 @@ class Env(VecEnv):
         held = (self.q, self.qd, self._tensors["contact_gap"]) if of_pairs else ()
         self._spare = tuple(map(torch.zeros_like, held))
         self._kernels = self._build(tracing)
+        self._read_first, self._steps = tracing.stages["act"].read_arrays(), 0
+        self._failures = None if keep_failures is None else FailureRing(self, keep_failures)
+        self._status = None if self._failures is None else self._failures.status
         wanted = graph is None or arguments.checked_bool("graph", graph)
         self.replay = Replay(self._parts(), wanted and self.warp_device.is_cuda)
         if self.warp_device.is_cuda:
@@ -284,6 +295,8 @@ class Env(VecEnv):
         self.actions.copy_(arguments.checked_actions("Env.step", actions, self.num_envs, self.action_labels))
         self.replay()
         self._steps += 1
+        if self._failures is not None:
+            self._failures.look()
         out = self._store.out.clone()
         extras: dict[str, Any] = {"time_outs": self._store.part(out, "time_out").view(-1)}
         if self._steps % self.log_interval == 0:
@@ -316,13 +329,19 @@ class Env(VecEnv):
         return own + (delays + run.workspace_bytes) // self.num_envs
 
     def close(self) -> None:
-        """Do nothing: memory is freed with the object."""
+        """Wait for files of failures that are being written; memory is freed with the object."""
+        self.failure_files()
+
+    def failure_files(self) -> list[Path]:
+        """Wait for the device, and return the files of ``keep_failures`` that this environment has written."""
+        return [] if self._failures is None else self._failures.finish()
 
     # -- state outside of it ---------------------------------------------------------------------------------------
     levels = checkpoint.levels
     start_at = checkpoint.start_at
     state_dict = checkpoint.state_dict
     load_state_dict = checkpoint.load_state_dict
+    replay_failure = failure_replay.replay_failure
     __reduce__, __repr__ = checkpoint.reduce, describe
 
     # -- inside ----------------------------------------------------------------------------------------------------
@@ -369,17 +388,23 @@ class Env(VecEnv):
                 self._launch(name)
             self._physics()
             self._after_reset()
+            if self._failures is not None:
+                self._failures.find()
         torch.cuda.synchronize(self.device)
+        if self._failures is not None:
+            self._failures.clear()
 
     def _parts(self) -> list[Part]:
         """Return the parts of a step."""
         after = [Part(lambda: self._after("judge")), *self._user_parts("judge")]
-        last = [Part(self._after_reset), *self._user_parts("observe"), Part(lambda: self._launch("observe"))]
+        last = [Part(self._after_reset), *self._user_parts("observe"), Part(self._observe)]
         final = [*self._user_parts("observe"), Part(self._observe_final)] if self.final else []
-        return [Part(self._physics), *final, *after, Part(lambda: self._launch("judge")), *last]
+        return [Part(self._physics), *final, *after, Part(self._judge), *last]
 
     def _physics(self) -> None:
         """Compute the controls from the actions, and step the dynamics of all worlds in place."""
+        if self._failures is not None:
+            self._failures.keep()
         self._launch("act")
         controls = self._controls
         self.dyn.step(
@@ -391,11 +416,23 @@ class Env(VecEnv):
             target_q=controls.get("target_q"),
             actuator_state=self._actuator_state,
             options=self._step_options,
+            status=self._status,
             report=self._report,
             out=(self.q, self.qd),
         )
         if "actuator_force" in self._tensors:
             self.dyn.actuator_force(self.q, self.qd, controls["ctrl"], out=self._tensors["actuator_force"])
+
+    def _judge(self) -> None:
+        if self._failures is not None and self._layout.users:
+            self._failures.keep_judged()
+        self._launch("judge")
+
+    def _observe(self) -> None:
+        observe = functools.partial(self._launch, "observe")
+        if self._failures is None:
+            return observe()
+        run_all([observe, self._failures.find], self.device)
 
     def _observe_final(self) -> None:
         self._after("final")

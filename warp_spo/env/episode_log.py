@@ -106,6 +106,8 @@ def explain(env: Env, stages: dict[str, list[Launch]], users: dict[Any, tuple[st
         f"variable     {', '.join(env.values) or 'nothing'}",
         f"memory       {env.bytes_per_world} bytes a world",
     ]
+    if env._failures is not None:
+        lines.append(f"failures     {env._failures.describe()}")
     kernels = [(name, kernel) for name, some in stages.items() for kernel in some]
     parts = [f"{each.threads} threads a world, each" if each.threads else "a world," for _, each in kernels]
     lines += [f"{name:12} {part} {one.operations} operations" for (name, one), part in zip(kernels, parts, strict=True)]

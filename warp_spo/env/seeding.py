@@ -46,6 +46,8 @@ def _write(env: Env, seed: int, ticks: np.ndarray) -> None:
     words = [seed & 0xFFFFFFFF, seed >> 32 & 0xFFFFFFFF, env.first_world]
     env._tensors["key"].copy_(torch.tensor(np.array(words, dtype=np.uint32).view(np.int32)))
     env._tensors["tick"].copy_(torch.tensor(ticks.view(np.int32)))
+    if env._failures is not None:
+        env._failures.restart(seed, env._steps)
 
 
 def _checked(call: str, seed: Any, worlds: int) -> tuple[int, np.ndarray]:

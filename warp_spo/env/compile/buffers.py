@@ -11,6 +11,7 @@ from .fused_kernel import COLUMN, COUNT, FOUND, INT, LONG, MASK, ROW, SHARED, Bu
 from .memory_layout import MemoryLayout
 
 CONTACT_ARRAYS = {"contact_f": 3, "contact_gap": 1, "contact_slip": 1}  # entries of each point, and of each pair
+FAULT = "fault"  # the guard's code of what has ended a world in this step; no part of a state
 LINE = 32  # scalars of a line of the caches
 
 
@@ -74,6 +75,7 @@ class Storage:
         """Return the tensors that steps change, by name; "out" holds all results."""
         results = {self._output(name) for name in self.places}
         own = {name for name, buffer in self.buffers.items() if buffer.memory_order != SHARED} | {"key"}
+        own -= {FAULT}
         return {name: x for name, x in self.tensors.items() if name in own - results} | {"out": self.out}
 
     def worlds_of(self) -> dict[str, tuple[torch.Tensor, int]]:
@@ -112,6 +114,8 @@ class Storage:
         self._add("advance", self._zeros(1) + 1.0, SHARED)
         self._add("episode_length", self._zeros(worlds, dtype=torch.int64), LONG)
         self._add("chosen", self._zeros(worlds, dtype=torch.bool), MASK)
+        if layout.keeps_failures:
+            self._add(FAULT, self._zeros(worlds, dtype=torch.int32), INT)
 
     def _add_controls(self, layout: MemoryLayout, read: set[str]) -> None:
         for name in sorted(layout.action_arrays):

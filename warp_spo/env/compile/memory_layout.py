@@ -31,6 +31,7 @@ class MemoryLayout:
         values: names of the scene's values that events change. unequal: of those that stages read, and that differ
             between worlds of the scene itself.
         guard: what ends worlds whose numbers are out of bounds.
+        keeps_failures: whether "judge" leaves what has ended a world in the array "fault".
         outputs: names under which kernels write results ("reward", a group of observations, ...), by result.
     """
 
@@ -67,6 +68,7 @@ class MemoryLayout:
         self.users: dict[Any, tuple[str, int]] = {}
         self.user_size = 0
         self.sensors: dict[str, tuple[int, float | None, Any]] = {}
+        self.keeps_failures = False
         self.outputs: dict[str, str] = {}
 
     def remember(self, name: str, size: int, reset: Any = LEFT_OUT) -> int:

@@ -22,6 +22,7 @@ from ..events import EncoderBias, Interval, Reset, Start, Values
 from ..observations import Observation, name_of
 from ..world import World
 from . import starts
+from .buffers import FAULT
 from .fused_kernel import FusedKernel
 from .guard import BEYOND, LARGEST, NOT_FINITE, Check, first, within
 from .memory_layout import MemoryLayout
@@ -156,6 +157,8 @@ class Tracing:
         fault = first([*checks, *(self.guard.read_observations(w, "final ") if self.final else ())], "fault")
         bad = fault > 0.5
         stage.store("faults", 0, as_value(fault))
+        if self.layout.keeps_failures:
+            stage.store(FAULT, 0, as_value(fault))
         for name, value in earned.items():
             w.keep(f"sum reward {name}", w.memory(f"sum reward {name}", 1) + where(bad, 0.0, value))
         ends = {name: condition(f"termination {name!r} returned", term(w)) for name, term in self.terminations.items()}

@@ -31,7 +31,10 @@ def task(name: str) -> Any:
     return load(name, TASKS)
 
 
-OPEN = ("first_world", "passes", "granularity", "graph", "log_interval", "final_observations", "bounds", "cfg")
+OPEN = (
+    "first_world", "passes", "granularity", "graph", "log_interval", "final_observations", "bounds", "cfg",
+    "keep_failures",
+)  # fmt: skip
 """Arguments of ``Env`` that tasks leave to the caller."""
 
 
