@@ -115,8 +115,9 @@ def keep_most_severe(_=None) -> wp.Kernel:
     @wp.kernel(module="warp_spo_contacts", enable_backward=False)
     def kernel(status: wp.array[wp.int32], severity: wp.array[wp.int32], kept_out: wp.array[wp.int32]):
         world = wp.tid()
-        if severity[status[world]] > severity[kept_out[world]]:
-            kept_out[world] = status[world]
+        word = status[world]
+        if word != OK and severity[word] > severity[kept_out[world]]:
+            kept_out[world] = word
 
     return kernel
 
