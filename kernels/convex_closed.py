@@ -123,7 +123,7 @@ NATIVE = r"""
                 const REAL s = (a[k] * size_of(n[k]) + a[l] * size_of(n[l]) + b[p] * size_of(R[3 * i + q])
                                    + b[q] * size_of(R[3 * i + p]) - size_of(along)) / length;
                 if (s < -most) return false;
-                if (!(s < best.overlap - (REAL)SETTLED * a[0])) continue;
+                if (!(s < best.overlap - (REAL)1e-5 * a[0])) continue;
                 best.overlap = s;
                 edge = 3 * i + j;
                 const REAL scale = along < 0 ? 1 / length : -1 / length;

@@ -49,7 +49,7 @@ NATIVE = r"""
     // The shares of three points, of which there are ``count``, in their point nearest to the origin, and that.
     static CUDA_CALLABLE inline void nearest_of(int count, const REAL* a, const REAL* b, const REAL* c, REAL* share, REAL* v)
     {
-        REAL ab[3], ac[3];
+        REAL ab[3], ac[3], bc[3], ca[3], xy[3], normal[3];
         UNROLL
         for (int r = 0; r < 3; ++r) {
             ab[r] = b[r] - a[r];
@@ -57,7 +57,12 @@ NATIVE = r"""
         }
         const REAL d1 = -dot(ab, a), d2 = -dot(ac, a), d3 = -dot(ab, b), d4 = -dot(ac, b), d5 = -dot(ab, c),
                    d6 = -dot(ac, c);
-        const REAL va = d3 * d6 - d5 * d4, vb = d5 * d2 - d1 * d6, vc = d1 * d4 - d3 * d2;
+        cross(ab, ac, normal);
+        cross(b, c, bc);
+        cross(c, a, ca);
+        cross(a, b, xy);
+        // not d3 d6 - d5 d4 and so on, which lose all digits where three points are nearly in line
+        const REAL va = dot(normal, bc), vb = dot(normal, ca), vc = dot(normal, xy);
         share[0] = share[1] = share[2] = 0;
         if (count == 1) {
             share[2] = 1;
@@ -85,8 +90,6 @@ NATIVE = r"""
             share[1] = vb * scale;
             share[2] = vc * scale;
             share[0] = 1 - share[1] - share[2];
-            REAL normal[3];  // the plane's own says more exactly where it is nearest
-            cross(ab, ac, normal);
             const REAL height = dot(normal, a) / dot(normal, normal);
             UNROLL
             for (int r = 0; r < 3; ++r) v[r] = height * normal[r];
@@ -176,38 +179,40 @@ NATIVE = r"""
         return true;
     }
 
-    // The best of the line between the middles and the normals of both shapes; false: apart by more than ``most``.
-    static CUDA_CALLABLE inline bool begin_search(const Two& two, REAL most, Least& best)
+    // The line between the middles and the best normals of each shape; false: apart by more than ``most``.
+    static CUDA_CALLABLE inline bool first_directions(const Two& two, REAL most, REAL* seeds, REAL* overlaps)
     {
         REAL from[2][3], x[3], y[3];
         const REAL apart = sqrt(dot(two.at, two.at));
         turned_back(two.turn, two.at, from[1]);
         UNROLL
         for (int r = 0; r < 3; ++r) {
-            best.normal[r] = apart > 0 ? -two.at[r] / apart : r == 2;
+            seeds[r] = apart > 0 ? -two.at[r] / apart : r == 2;
             from[0][r] = two.at[r];
             from[1][r] = -from[1][r];
         }
-        best.overlap = two.overlap(best.normal, x, y);
-        if (best.overlap < -most) return false;
+        overlaps[0] = two.overlap(seeds, x, y);
+        if (overlaps[0] < -most) return false;
         UNROLL
         for (int which = 0; which < 2; ++which) {
             const Shape& shape = which ? two.b : two.a;
+            REAL least = overlaps[0];
+            overlaps[1 + which] = NONE;
             LOOP
             for (int i = 0; i < normals_of(shape); ++i) {
                 REAL u[3], n[3];
                 const REAL reach = normal_of(shape, two.tables, i, from[which], u);
                 const REAL bound = reach - dot(u, from[which]);  // the other shape holds its middle
-                if (bound >= best.overlap) continue;
+                if (bound >= least) continue;
                 turned(two.turn, u, n);
                 UNROLL
                 for (int r = 0; r < 3; ++r) n[r] = which ? n[r] : -u[r];
                 const REAL s = two.overlap(n, x, y);
                 if (s < -most) return false;
-                if (!(s < best.overlap)) continue;
-                best.overlap = s;
+                if (!(s < least)) continue;
+                overlaps[1 + which] = least = s;
                 UNROLL
-                for (int r = 0; r < 3; ++r) best.normal[r] = n[r];
+                for (int r = 0; r < 3; ++r) seeds[3 + 3 * which + r] = n[r];
             }
         }
         return true;
@@ -216,13 +221,28 @@ NATIVE = r"""
     // Finds the least overlap; false: the cores are apart by more than ``most``.
     static CUDA_CALLABLE inline bool search(const Two& two, REAL most, Least& best)
     {
-        if (!begin_search(two, most, best)) return false;
+        REAL seeds[9], overlaps[3];
+        if (!first_directions(two, most, seeds, overlaps)) return false;
         const REAL gap = (REAL)GAP * (two.a.least() + two.b.least());
+        best.overlap = NONE;
         LOOP
-        for (int turn = 0; turn < TURNS; ++turn) {
-            const REAL before = best.overlap, shift = before + gap;
-            if (!approach(two, shift > 0 ? shift : 0, most, best)) return false;
-            if (!(shift > 0) || !(best.overlap < before - (REAL)SETTLED * gap)) break;
+        for (int seed = 0; seed < 3; ++seed) {
+            if (!(overlaps[seed] < NONE)) continue;
+            Least found;
+            found.overlap = overlaps[seed];
+            UNROLL
+            for (int r = 0; r < 3; ++r) found.normal[r] = seeds[3 * seed + r];
+            bool apart = false;
+            LOOP
+            for (int turn = 0; turn < TURNS; ++turn) {
+                const REAL before = found.overlap, shift = before + gap;
+                if (!approach(two, shift > 0 ? shift : 0, most, found)) return false;
+                apart = !(shift > 0);
+                if (apart || !(found.overlap < before - (REAL)SETTLED * gap)) break;
+            }
+            if (!(found.overlap < best.overlap - (REAL)1e-3 * gap)) continue;
+            best = found;
+            if (apart) break;
         }
         return true;
     }

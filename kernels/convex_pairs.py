@@ -32,6 +32,7 @@ NUMBERS = {
     "SAME": 1e-3,  # share of both smallest sizes within which two points are one
     "LACKS": 0.1,  # share of that by which a polygon's depth may be less than that of the shapes
     "GAP": GAP,
+    "NONE": 1e9,  # overlap of directions that are not there [m]
 }
 WHOLE = {
     "LARGEST_FACE": convex_shapes.LARGEST_FACE, "RAW": convex_manifold.RAW, "POINTS": POINTS, "ENTRY": ENTRY,
