@@ -1,4 +1,4 @@
-"""Pairs of convex shapes in closed form, for :mod:`.convex_pairs`: round ones, a ball on a box, boxes, and the half space.
+"""Pairs of convex shapes in closed form, for :mod:`.convex_pairs`: round ones, a ball on a box, boxes, a half space.
 
 Two boxes have fifteen axes along which they may be apart: three normals of each, and nine that are across an edge of
 each (Gottschalk, Lin and Manocha 1996). Where edges cross, the points are those of the two edges that are nearest to

@@ -5,10 +5,10 @@ core and a of the first; the depth is the least s(n), where the distance between
 directions are tried, the best one counts, so no depth is less than the true one.
 
 The search for it shifts the first core along n until both are ``gap`` apart along n, and takes the direction between
-their nearest points (Gilbert, Johnson and Keerthi 1988) as the next n. Then s falls, or n was the direction where it is
-least around: s' <= (s + gap) cos - gap <= s, cos of the angle between both. Cores that are apart by more than the gap are
-not shifted, and are done in one go. It begins at the best of the shapes' own normals and the line between the middles,
-so what it finds is the least overlap wherever another dent of s does not lie between.
+their nearest points (Gilbert, Johnson and Keerthi 1988) as the next n. Then s falls, or n was the direction where it
+is least around: s' <= (s + gap) cos - gap <= s, cos of the angle between both. Cores that are apart by more than the
+gap are not shifted, and are done in one go. It begins at three directions, the best normal of each shape and the line
+between the middles, and the least of what it finds counts.
 """
 
 NATIVE = r"""
@@ -46,8 +46,10 @@ NATIVE = r"""
         REAL normal[3], overlap, a[3], b[3];
     };
 
-    // The shares of three points, of which there are ``count``, in their point nearest to the origin, and that.
-    static CUDA_CALLABLE inline void nearest_of(int count, const REAL* a, const REAL* b, const REAL* c, REAL* share, REAL* v)
+    // The shares of one point, c, two, a and c, or three in their point nearest to the origin, and that, v. Ericson
+    // 2005, section 5.1.5.
+    static CUDA_CALLABLE inline void nearest_of(int count, const REAL* a, const REAL* b, const REAL* c, REAL* share,
+        REAL* v)
     {
         REAL ab[3], ac[3], bc[3], ca[3], xy[3], normal[3];
         UNROLL
@@ -104,7 +106,8 @@ NATIVE = r"""
     static CUDA_CALLABLE inline bool approach(const Two& two, REAL shift, REAL most, Least& best)
     {
         const REAL move[3] = {shift * best.normal[0], shift * best.normal[1], shift * best.normal[2]};
-        REAL w[3][3] = {{0}}, p[3][3] = {{0}}, share[3] = {0, 0, 0}, v[3] = {best.normal[0], best.normal[1], best.normal[2]}, vv = 1;
+        REAL w[3][3] = {{0}}, p[3][3] = {{0}}, share[3] = {0, 0, 0}, vv = 1;
+        REAL v[3] = {best.normal[0], best.normal[1], best.normal[2]};
         int count = 0;
         LOOP
         for (int step = 0; step < STEPS; ++step) {
@@ -173,7 +176,9 @@ NATIVE = r"""
         }
         UNROLL
         for (int r = 0; r < 3; ++r) {
-            best.a[r] = share[0] * p[0][r] + (count > 1 ? share[1] * p[1][r] : 0) + (count > 2 ? share[2] * p[2][r] : 0);
+            best.a[r] = share[0] * p[0][r];
+            best.a[r] += count > 1 ? share[1] * p[1][r] : 0;
+            best.a[r] += count > 2 ? share[2] * p[2][r] : 0;
             best.b[r] = best.a[r] + move[r] - v[r];
         }
         return true;

@@ -1,7 +1,7 @@
 """The points that two convex shapes share along a known normal, for :mod:`.convex_pairs`.
 
-If a face or a cylinder's cap looks along the normal, the other shape's face, or segment, is clipped by its sides, edge by
-edge, and the corners of the common face that lie over the other one close the polygon. Their depths are those below
+If a face or a cylinder's cap looks along the normal, the other shape's face, or segment, is clipped by its sides, edge
+by edge, and the corners of the common face that lie over the other one close the polygon. Their depths are those below
 the common face; what is left over reach far apart is left out. Of more points than there may be, the deepest stays,
 the one farthest from it, and on both sides of these the one that spans most. Segments side by side have their deepest
 point and both ends of the part that they share; all else has one point.
@@ -186,17 +186,24 @@ NATIVE = r"""
         }
     }
 
-    // Puts the deepest point of two cores, and, of segments side by side, the ends of the part that they share.
-    static CUDA_CALLABLE inline void put_deepest(const Two& two, const Least& best, const Feature& f, const Feature& g,
-        Sink& sink)
+    // Puts the deepest point of two cores.
+    static CUDA_CALLABLE inline void put_deepest(const Two& two, const Least& best, Sink& sink)
     {
         const REAL* n = best.normal;
-        const REAL r = two.a.radius, s = two.b.radius, depth = best.overlap + r + s;
+        const REAL r = two.a.radius, s = two.b.radius;
         REAL place[3];
         UNROLL
         for (int k = 0; k < 3; ++k) place[k] = (REAL)0.5 * (best.a[k] - r * n[k] + best.b[k] + s * n[k]);
-        sink.put(place, n, depth);
+        sink.put(place, n, best.overlap + r + s);
+    }
+
+    // Puts the ends of the part that two segments share, if they lie side by side: they are those of features.
+    static CUDA_CALLABLE inline void put_ends(const Two& two, const Least& best, const Feature& f, const Feature& g,
+        Sink& sink)
+    {
         if (f.count != 2 || g.count != 2) return;
+        const REAL* n = best.normal;
+        const REAL r = two.a.radius, s = two.b.radius;
         const REAL uu = dot(f.u, f.u), vv = dot(g.u, g.u), uv = dot(f.u, g.u);
         if (!(uu > 0) || !(vv > 0) || uu * vv - uv * uv > (REAL)ASIDE * uu * vv) return;
         // the part of the first segment over the second one, in shares of its half
@@ -208,7 +215,7 @@ NATIVE = r"""
         for (int end = 0; end < 2; ++end) {
             const REAL share = end ? high : low;
             if (!(low < high)) return;
-            REAL x[3], y[3], way[3], at_it[3];
+            REAL x[3], y[3], way[3], at_it[3], place[3];
             UNROLL
             for (int k = 0; k < 3; ++k) {
                 x[k] = f.middle[k] + share * f.u[k];
@@ -233,6 +240,7 @@ NATIVE = r"""
     // Puts the points along a known normal.
     static CUDA_CALLABLE inline void manifold(const Two& two, const Least& best, Sink& sink)
     {
+        if (is_point(two.a) || is_point(two.b)) return put_deepest(two, best, sink);
         const REAL* n = best.normal;
         const REAL back[3] = {-n[0], -n[1], -n[2]};
         REAL own[3];
@@ -272,6 +280,7 @@ NATIVE = r"""
                 return;
             }
         }
-        put_deepest(two, best, f, g, sink);
+        put_deepest(two, best, sink);
+        put_ends(two, best, f, g, sink);
     }
 """

@@ -54,16 +54,14 @@ def routine(first: int, second: int) -> int:
     return CONVEX
 
 
-TABLE = {
-    (KINDS[i], KINDS[j]): ROUTINES[routine(i, j)] for j in range(PLANE + 1) for i in range(min(j, PLANE - 1) + 1)
-}
+TABLE = {(KINDS[i], KINDS[j]): ROUTINES[routine(i, j)] for j in range(PLANE + 1) for i in range(min(j, PLANE - 1) + 1)}
 """The routine of each pair of kinds, the lower one first."""
 
 COLLIDE = r"""
     // Puts the points of two shapes at poses (place, quaternion xyzw); returns how many there are. ``reach``: how far
     // apart points may be that count.
-    static CUDA_CALLABLE inline int collide(const Shape& one, const Shape& other, const Tables& tables, const REAL* pose,
-        const REAL* other_pose, REAL reach, REAL* to)
+    static CUDA_CALLABLE inline int collide(const Shape& one, const Shape& other, const Tables& tables,
+        const REAL* pose, const REAL* other_pose, REAL reach, REAL* to)
     {
         // the lower kind comes first
         const bool swap = one.kind > other.kind;
@@ -91,12 +89,25 @@ COLLIDE = r"""
         const REAL most = two.a.radius + two.b.radius + reach;
         Least best;
         bool near = false;
-        IF_ROUND if (two.b.kind <= CAPSULE) near = rounds(two, most, best); else
+        IF_ROUND if (two.b.kind <= CAPSULE) return put_rounds(two, most, sink); else
         IF_BALL_ON_BOX if (two.a.kind == SPHERE && two.b.kind == BOX) near = ball_on_box(two, most, best); else
         IF_BOXES if (two.a.kind == BOX && two.b.kind == BOX) near = boxes(two, most, best); else
         IF_CONVEX near = search(two, most, best);
         ;
         if (near) manifold(two, best, sink);
+        return sink.count;
+    }
+
+    static CUDA_CALLABLE inline int put_rounds(const Two& two, REAL most, Sink& sink)
+    {
+        Least best;
+        if (!rounds(two, most, best)) return 0;
+        put_deepest(two, best, sink);
+        if (two.a.kind == SPHERE) return sink.count;
+        const REAL along[3] = {0, 0, 1};
+        Feature f = facing(two.a, two.tables, along), g = facing(two.b, two.tables, along);
+        g.move(two.turn, two.at);
+        put_ends(two, best, f, g, sink);
         return sink.count;
     }
 

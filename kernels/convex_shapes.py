@@ -65,6 +65,12 @@ NATIVE = r"""
         }
     };
 
+    // Whether other shapes touch it in one point alone.
+    static CUDA_CALLABLE inline bool is_point(const Shape& shape)
+    {
+        return shape.kind == SPHERE || shape.kind == ELLIPSOID;
+    }
+
     // The point of a shape's core that is farthest along ``d``, of any length, in the shape's axes.
     static CUDA_CALLABLE inline void support(const Shape& shape, const Tables& tables, const REAL* d, REAL* x)
     {
@@ -111,7 +117,8 @@ NATIVE = r"""
         return kind == HULL ? shape.faces : kind == BOX || kind == CYLINDER ? 3 : kind == ELLIPSOID ? 1 : 0;
     }
 
-    static CUDA_CALLABLE inline REAL normal_of(const Shape& shape, const Tables& tables, int i, const REAL* other, REAL* u)
+    static CUDA_CALLABLE inline REAL normal_of(const Shape& shape, const Tables& tables, int i, const REAL* other,
+        REAL* u)
     {
         if (shape.kind == HULL) {
             const REAL* plane = tables.plane + 4 * (shape.face + i);

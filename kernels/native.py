@@ -15,7 +15,17 @@ const long long thread = index;
 #endif
 """
 """The number of the thread, in 64 bits. On CUDA it needs a grid of one axis, as ``runtime.launches`` gives."""
-INTEGERS = ("place", "shifts", "status", "block_entries", "near_pairs", "shape_rows", "face_starts", "face_corners", "counts")
+INTEGERS = (
+    "place",
+    "shifts",
+    "status",
+    "block_entries",
+    "near_pairs",
+    "shape_rows",
+    "face_starts",
+    "face_corners",
+    "counts",
+)
 """Names of the arrays that hold integers; each has one axis."""
 
 

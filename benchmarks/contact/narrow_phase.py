@@ -1,6 +1,7 @@
 """Points of every pair of convex shapes against truths at random shallow poses; their time on a GPU.
 
-    python -m benchmarks.contact.narrow_phase [PAIR ...] [--poses N] [--dtype NAME] [--json FILE] [--device cuda:0 --time]
+    python -m benchmarks.contact.narrow_phase [PAIR ...] [--poses N] [--dtype NAME] [--json FILE]
+    python -m benchmarks.contact.narrow_phase --poses 100 --device cuda:0 --time --json FILE      # times, too
 
 A pose is a shape that came along a random line until it was 0.5 to 3 mm deep in the other one; the truths are those
 of ``warp_spo.reference.convex_overlap``: all separating axes of polyhedra, and the least overlap over all directions of
@@ -13,7 +14,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from warp_spo.dynamics.convex_contacts import ConvexContacts, PairShape
-from warp_spo.reference.convex_overlap import Overlaps, PosedPair, GrownShape
+from warp_spo.reference.convex_overlap import GrownShape, Overlaps, PosedPair
 
 from .. import command_line
 
@@ -31,6 +31,8 @@ EQUAL = 1e-6  # overlaps that are one [m]
 CLOSE = 5e-5  # error of a depth [m]
 TRIES, MOVES = 12, 4  # of poses, and along the line to where it is as deep as wanted
 ON_BOTH = 1e-3  # how far a point may be outside of one shape in addition to half its depth [m]
+MANY = 5  # one of so many poses is tried with a hull of 64 corners, whose truth takes long
+WORLDS, LAUNCHES, REPEATS = (4096, 16384), 10, 20  # of times
 POLYHEDRA = ("box", "hull", "hull64")
 
 
@@ -98,7 +100,9 @@ class ShallowPoses(NamedTuple):
 def shallow_poses(first: PairShape, second: PairShape, count: int, seed: int) -> ShallowPoses:
     """Return random poses in which two shapes are 0.5 to 3 mm deep in each other."""
     rng, a, b = np.random.default_rng(seed), solid(first), solid(second)
-    size = sum(np.linalg.norm(one.size) + one.radius if one.corners is None else np.abs(one.corners).max() for one in (a, b))
+    size = sum(
+        np.linalg.norm(one.size) + one.radius if one.corners is None else np.abs(one.corners).max() for one in (a, b)
+    )
     found: list[Any] = []
     for _ in range(TRIES):
         turns = [random_turns(rng, count) for _ in range(2)]
@@ -118,7 +122,11 @@ def shallow_poses(first: PairShape, second: PairShape, count: int, seed: int) ->
         found.append((pair.of(good), [turn[good] for turn in turns], truth.depth[good], truth.normal[good]))
         if sum(len(one[2]) for one in found) >= count:
             break
-    joined = [np.concatenate([getattr(one[0], name) for one in found])[:count] for name in ("turn_a", "turn_b", "place")]
+    if sum(len(one[2]) for one in found) < count:
+        raise RuntimeError(f"{first.kind} and {second.kind}: fewer than {count} shallow poses in {TRIES} tries")
+    joined = [
+        np.concatenate([getattr(one[0], name) for one in found])[:count] for name in ("turn_a", "turn_b", "place")
+    ]
     turns = [np.concatenate([one[1][which] for one in found])[:count] for which in range(2)]
     depth, normal = (np.concatenate([one[which] for one in found])[:count] for which in (2, 3))
     return ShallowPoses(PosedPair(a, b, *joined), (turns[0], turns[1]), Overlaps(depth, normal))
@@ -144,9 +152,9 @@ class PairErrors(NamedTuple):
     """What a pair of shapes does at shallow poses.
 
     Attributes:
-        missed, ghosts: poses without a point, and poses apart with one. normals: share within ANGLE. worst: largest angle
-            of a normal whose overlap is not the truth's [degrees]. depths: share within CLOSE. error: of depths, the 95 %
-            quantile [mm]. strays: points that lie outside of a shape. points: on average.
+        missed, ghosts: poses without a point, and poses apart with one. normals: share within ANGLE. worst: largest
+            angle of a normal whose overlap is not the truth's [degrees]. depths: share within CLOSE. error: of depths,
+            the 95 % quantile [mm]. strays: points that lie outside of a shape. points: on average.
     """
 
     pair: str
@@ -168,28 +176,60 @@ class PairErrors(NamedTuple):
         return not (self.missed or self.ghosts or self.strays) and self.normals >= right and self.depths >= 0.95
 
 
-def pair_errors(names: tuple[str, str], count: int, dtype: str, device: str | None = None, seed: int = 0) -> PairErrors:
+class PairsAtPoses:
+    """Pairs of shapes at shallow poses, each with shapes of its own, so that one kernel finds the points of all.
+
+    Args:
+        pairs: names of two kinds each. count: poses of each pair. seed: of their random numbers.
+    """
+
+    def __init__(self, pairs: Sequence[tuple[str, str]], count: int, seed: int = 0):
+        self.pairs, rng = tuple(pairs), np.random.default_rng(seed)
+        self.shapes = [shape for a, b in self.pairs for shape in (SHAPES[a][0], SHAPES[b][1])]
+        self.made = [shallow_poses(*self.shapes[2 * i : 2 * i + 2], count, seed) for i in range(len(self.pairs))]
+        self.poses = np.concatenate([made.poses(made.pair.place) for made in self.made], axis=1)
+        gaps = [made.truth.depth + rng.uniform(*DEPTHS, count) for made in self.made]
+        places = [made.pair.place - gap[:, None] * made.truth.normal for made, gap in zip(self.made, gaps, strict=True)]
+        self.apart = np.concatenate([made.poses(at) for made, at in zip(self.made, places, strict=True)], axis=1)
+
+    def contacts(self, dtype: str, device: str | None = None) -> ConvexContacts:
+        """Return what finds the points."""
+        return ConvexContacts(
+            self.shapes, [(2 * i, 2 * i + 1) for i in range(len(self.pairs))], dtype=dtype, device=device
+        )
+
+    def errors(self, dtype: str, device: str | None = None) -> list[PairErrors]:
+        """Compare the points of every pair with the truths."""
+        contacts = self.contacts(dtype, device)
+        near, apart = contacts(self.poses), contacts(self.apart)
+        found = []
+        for i, (names, made) in enumerate(zip(self.pairs, self.made, strict=True)):
+            ghosts = there_of(apart.counts[:, i]) & (apart.points[:, i, :, 6] > 0.0)
+            found.append(pair_errors(names, dtype, made, near.points[:, i], near.counts[:, i], int(ghosts.sum())))
+        return found
+
+
+def there_of(counts: np.ndarray) -> np.ndarray:
+    """Return a mask of the points that are there [pose, 8]."""
+    return np.arange(8) < counts[:, None]
+
+
+def pair_errors(
+    names: tuple[str, str], dtype: str, made: ShallowPoses, points: np.ndarray, counts: np.ndarray, ghosts: int
+) -> PairErrors:
     """Compare a pair's points with the truths."""
-    shapes = SHAPES[names[0]][0], SHAPES[names[1]][1]
-    made, rng = shallow_poses(*shapes, count, seed), np.random.default_rng(seed + 1)
-    contacts = ConvexContacts(shapes, [(0, 1)], dtype=dtype, device=device)
-    points, counts = (values[:, 0] for values in contacts(made.poses(made.pair.place)))
-    gap = made.truth.depth + rng.uniform(*DEPTHS, len(points))
-    apart = contacts(made.poses(made.pair.place - gap[:, None] * made.truth.normal))
-    there = np.arange(points.shape[1]) < counts[:, None]
+    there = there_of(counts)
     depth = np.where(there, points[..., 6], -np.inf)
-    deepest = depth.argmax(axis=1)
-    every = np.arange(len(points))
-    normal, touching = points[every, deepest, 3:6], depth[every, deepest] > 0.0
+    deepest, every = depth.argmax(axis=1), np.arange(len(points))
+    normal, touching = points[every, deepest, 3:6].astype(np.float64), depth[every, deepest] > 0.0
     angle = np.degrees(np.arccos(np.clip(np.einsum("pr,pr->p", normal, made.truth.normal), -1.0, 1.0)))
-    excess = made.pair.overlap(normal[:, None].astype(np.float64))[:, 0] - made.truth.depth
+    excess = made.pair.overlap(normal[:, None])[:, 0] - made.truth.depth
     angle = np.where(excess < EQUAL, 0.0, angle)[touching]
     error = np.abs(depth[every, deepest] - made.truth.depth)[touching]
     return PairErrors(
-        " ".join(names), dtype, len(points), int((~touching).sum()), int((apart.points[:, 0, :, 6] > 0.0)[
-            np.arange(points.shape[1]) < apart.counts[:, :1]].sum()), float((angle <= ANGLE).mean()), float(angle.max()),
-        float((error <= CLOSE).mean()), float(np.quantile(error, 0.95) * 1e3), count_strays(made.pair, points, there),
-        float(counts.mean()),
+        " ".join(names), dtype, len(points), int((~touching).sum()), ghosts, float((angle <= ANGLE).mean()),
+        float(angle.max()), float((error <= CLOSE).mean()), float(np.quantile(error, 0.95) * 1e3),
+        count_strays(made.pair, points, there), float(counts.mean()),
     )  # fmt: skip
 
 
@@ -206,42 +246,44 @@ def count_strays(pair: PosedPair, points: np.ndarray, there: np.ndarray) -> int:
 
 # -- time --------------------------------------------------------------------------------------------------------------
 def timed(device: str, near: int = 24) -> Iterator[dict[str, Any]]:
-    """Yield times of near pairs, all of two kinds or mixed as on a hand, at shallow poses."""
+    """Yield times of near pairs, all of the same two kinds, or of several as on a hand, at shallow poses."""
     import warp as wp
 
     from warp_spo.runtime.launches import launch
 
-    mixed = [("capsule", "box")] * 10 + [("box", "box")] * 8 + [("capsule", "capsule")] * 4 + [("hull", "box")] * 2
-    lists = {" ".join(pair): [pair] * near for pair in PAIRS} | {"mixed": mixed}
+    hand = [("capsule", "box")] * 10 + [("box", "box")] * 8 + [("capsule", "capsule")] * 4 + [("box", "hull")] * 2
+    lists = {" ".join(pair): [pair] * near for pair in PAIRS} | {"hand": hand}
     for name, pairs in lists.items():
-        kinds = sorted({one for pair in pairs for one in pair})
-        shapes = [SHAPES[kind][side] for kind in kinds for side in range(2)]
-        numbers = [(2 * kinds.index(a), 2 * kinds.index(b) + 1) for a, b in pairs]
-        every = {pair: shallow_poses(SHAPES[pair[0]][0], SHAPES[pair[1]][1], 128, 0) for pair in set(pairs)}
-        # a shape of its own for each side of each pair
-        own = [shapes[number] for pair in numbers for number in pair]
-        contacts = ConvexContacts(own, [(2 * i, 2 * i + 1) for i in range(len(pairs))], device=device)
-        for worlds in (4096, 16384):
-            poses = np.zeros((worlds, len(own), 7))
+        kinds = sorted(set(pairs))
+        every = PairsAtPoses(kinds, 128)
+        shapes = [shape for pair in pairs for shape in (SHAPES[pair[0]][0], SHAPES[pair[1]][1])]
+        contacts = ConvexContacts(shapes, [(2 * i, 2 * i + 1) for i in range(len(pairs))], device=device)
+        for worlds in WORLDS:
+            poses = np.zeros((worlds, len(shapes), 7))
             for i, pair in enumerate(pairs):
-                made = every[pair].poses(every[pair].pair.place)
-                poses[:, 2 * i : 2 * i + 2] = made[(np.arange(worlds) * 7 + i) % len(made)]
+                at = 2 * kinds.index(pair)
+                poses[:, 2 * i : 2 * i + 2] = every.poses[(np.arange(worlds) * 7 + 5 * i) % 128, at : at + 2]
             inputs, outputs, threads = contacts.prepare(poses)
-            call = lambda: launch(contacts.kernel, threads, inputs, outputs, device=device, block_dim=128)  # noqa: E731, B023
+
+            def call(threads: int = threads, inputs: Any = inputs, outputs: Any = outputs) -> None:
+                launch(contacts.kernel, threads, inputs, outputs, device=device, block_dim=128)  # noqa: B023
+
             call()
             wp.synchronize_device(device)
             with wp.ScopedCapture(device) as capture:
-                call()
+                for _ in range(LAUNCHES):
+                    call()
             took = []
-            for _ in range(30):
-                begin = wp.Event(device, enable_timing=True)
-                end = wp.Event(device, enable_timing=True)
+            for _ in range(REPEATS):
+                begin, end = (wp.Event(device, enable_timing=True) for _ in range(2))
                 wp.record_event(begin)
-                for _ in range(10):
-                    wp.capture_launch(capture.graph)
+                wp.capture_launch(capture.graph)
                 wp.record_event(end)
-                took.append(wp.get_event_elapsed_time(begin, end) * 100.0)
-            yield {"pair": name, "near": len(pairs), "worlds": worlds, "us": float(np.median(took)), "device": str(wp.get_device(device).name)}
+                took.append(wp.get_event_elapsed_time(begin, end) * 1e3 / LAUNCHES)
+            yield {
+                "pair": name, "near": len(pairs), "worlds": worlds, "us": round(float(np.median(took)), 1),
+                "points": float(outputs[1].numpy().mean()), "device": str(wp.get_device(device).name),
+            }  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -251,14 +293,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--dtype", action="append", choices=("float32", "float64"), help="both if none is given")
     parser.add_argument("--time", action="store_true", help="time 24 near pairs at 4,096 and 16,384 worlds, too; a GPU")
     options = parser.parse_args(arguments)
-    rows, times = [], []
-    for names in PAIRS:
-        if options.names and " ".join(names) not in options.names:
-            continue
+    pairs = [pair for pair in PAIRS if not options.names or " ".join(pair) in options.names]
+    rows, times = list[PairErrors](), list[dict[str, Any]]()
+    for pair in pairs:
+        count = options.poses if "hull64" not in pair else max(1, options.poses // MANY)
+        made = PairsAtPoses([pair], count)
         for dtype in options.dtype or ("float32", "float64"):
-            begin = time.perf_counter()
-            rows.append(pair_errors(names, options.poses, dtype, options.device))
-            print(rows[-1], "holds" if rows[-1].holds else "MISSES", f"{time.perf_counter() - begin:.1f} s", flush=True)
+            rows += made.errors(dtype, options.device)
+            print(rows[-1], "holds" if rows[-1].holds else "MISSES", flush=True)
     for row in timed(options.device) if options.time else ():
         times.append(row)
         print(row, flush=True)

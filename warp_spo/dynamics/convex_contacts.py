@@ -28,8 +28,8 @@ class PairShape(NamedTuple):
     Attributes:
         kind: "sphere", "capsule", "box", "cylinder", "ellipsoid", "hull" or "plane".
         sizes: [m]; of a sphere its radius; of a capsule and a cylinder its radius and half its length along z, without
-            the capsule's ends; of a box and an ellipsoid half their lengths; of a hull its points [point, 3], whose hull
-            has up to 64 corners; of a plane, the half space below z = 0, none.
+            the capsule's ends; of a box and an ellipsoid half their lengths; of a hull its points [point, 3], of which
+            up to 64 are corners; of a plane, the half space below z = 0, none.
         rounding: by how much the surface lies outside of these sizes [m].
     """
 
@@ -105,7 +105,8 @@ def shape_rows(call: str, shapes: Sequence[PairShape]) -> ShapeRows:
         sizes[number, 3] += shape.rounding
     return ShapeRows(
         np.array(rows, dtype=np.int32).reshape(-1, 5), sizes, np.vstack([np.zeros((0, 3)), *corners]),
-        np.vstack([np.zeros((0, 4)), *planes]), np.array(starts, dtype=np.int32), np.array(loops, dtype=np.int32), middles,
+        np.vstack([np.zeros((0, 4)), *planes]), np.array(starts, dtype=np.int32), np.array(loops, dtype=np.int32),
+        middles,
     )  # fmt: skip
 
 
@@ -178,7 +179,8 @@ class ConvexContacts:
         given = checked_array(call, "poses", poses, (worlds, count, 7)).copy()
         given[..., :3] += rotated(given[..., 3:], self.rows.middles)
         pairs = np.broadcast_to(self.pairs, (worlds, *self.pairs.shape))
-        near, places = self._upload(np.ascontiguousarray(pairs)), wp.array(given.ravel(), dtype=self.T, device=self.device)
+        near = self._upload(np.ascontiguousarray(pairs))
+        places: wp.array = wp.array(given.ravel(), dtype=self.T, device=self.device)
         size = convex_pairs.POINTS * convex_pairs.ENTRY
         points = wp.zeros(worlds * len(self.pairs) * size, dtype=self.T, device=self.device)
         counts = wp.zeros(worlds * len(self.pairs), dtype=wp.int32, device=self.device)
@@ -190,7 +192,8 @@ class ConvexContacts:
         launch(self.kernel, threads, inputs, outputs, device=self.device, block_dim=128)
         shape = (inputs[0], len(self.pairs))
         return ContactSets(
-            outputs[0].numpy().reshape(*shape, convex_pairs.POINTS, convex_pairs.ENTRY), outputs[1].numpy().reshape(shape)
+            outputs[0].numpy().reshape(*shape, convex_pairs.POINTS, convex_pairs.ENTRY),
+            outputs[1].numpy().reshape(shape),
         )
 
 

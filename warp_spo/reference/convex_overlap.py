@@ -1,9 +1,10 @@
-"""The specification of how deep two convex shapes overlap: dense float64 NumPy over many poses, without any search tree.
+"""The specification of how deep two convex shapes overlap: dense float64 NumPy over many poses, deliberately simple.
 
 Shapes a and b overlap along a unit vector n, towards a, by s(n) = h_b(n) + h_a(-n) - n . (place of a - place of b),
-where h is how far a shape reaches along a vector. The depth is the least s, and its n is the normal; where s < 0 for some n,
-the shapes are apart. For two polyhedra the least is at the normal of a face or across an edge of each, so all of these
-are tried; else the sphere is sampled, and the best samples are improved by trying directions in cones that shrink.
+where h is how far a shape reaches along a vector. The depth is the least s, and its n is the normal; where s < 0 for
+some n, the shapes are apart. For two polyhedra the least is at the normal of a face or across an edge of each, so all
+of these are tried; else the sphere is sampled, and the best samples are improved by trying directions in cones that
+shrink.
 """
 
 import functools
@@ -13,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 SAMPLES = 600  # directions over the sphere
-STARTS = 6  # of them that are improved
-ROUNDS = 70  # of improvement
-AROUND = 12  # directions in each
-FIRST, SHRINK = 0.15, 0.78  # the first cone's angle [rad], and by how much one shrinks in which nothing is better
+STARTS = 4  # of them that are improved
+ROUNDS = 80  # of improvement
+AROUND = 32  # directions in each
+FIRST, SHRINK = 0.15, 0.8  # the first cone's angle [rad], and by how much one shrinks in which nothing is better
 CROSSINGS = 2000  # pairs of edges at most that are all tried; of more the sphere is sampled
 TURN = 0.5  # radians by which the directions in a cone turn from round to round
 
