@@ -33,6 +33,11 @@ TRIES, MOVES = 12, 4  # of poses, and along the line to where it is as deep as w
 ON_BOTH = 1e-3  # how far a point may be outside of one shape in addition to half its depth [m]
 MANY = 5  # one of so many poses is tried with a hull of 64 corners, whose truth takes long
 WORLDS, LAUNCHES, REPEATS = (4096, 16384), 10, 20  # of times
+VARIED = 64  # poses of each pair that is timed
+TIMED = (
+    ("sphere", "box"), ("capsule", "capsule"), ("capsule", "box"), ("box", "box"), ("box", "cylinder"), ("box", "hull"),
+    ("cylinder", "cylinder"), ("ellipsoid", "ellipsoid"), ("hull", "hull"), ("hull64", "hull64"),
+)  # fmt: skip
 POLYHEDRA = ("box", "hull", "hull64")
 
 
@@ -198,9 +203,8 @@ class PairsAtPoses:
             self.shapes, [(2 * i, 2 * i + 1) for i in range(len(self.pairs))], dtype=dtype, device=device
         )
 
-    def errors(self, dtype: str, device: str | None = None) -> list[PairErrors]:
+    def errors(self, contacts: ConvexContacts, dtype: str) -> list[PairErrors]:
         """Compare the points of every pair with the truths."""
-        contacts = self.contacts(dtype, device)
         near, apart = contacts(self.poses), contacts(self.apart)
         found = []
         for i, (names, made) in enumerate(zip(self.pairs, self.made, strict=True)):
@@ -252,17 +256,18 @@ def timed(device: str, near: int = 24) -> Iterator[dict[str, Any]]:
     from warp_spo.runtime.launches import launch
 
     hand = [("capsule", "box")] * 10 + [("box", "box")] * 8 + [("capsule", "capsule")] * 4 + [("box", "hull")] * 2
-    lists = {" ".join(pair): [pair] * near for pair in PAIRS} | {"hand": hand}
+    lists = {" ".join(pair): [pair] * near for pair in TIMED} | {"hand": hand, "hand, apart": hand}
     for name, pairs in lists.items():
         kinds = sorted(set(pairs))
-        every = PairsAtPoses(kinds, 128)
+        every = PairsAtPoses(kinds, VARIED)
+        given = every.apart if "apart" in name else every.poses
         shapes = [shape for pair in pairs for shape in (SHAPES[pair[0]][0], SHAPES[pair[1]][1])]
         contacts = ConvexContacts(shapes, [(2 * i, 2 * i + 1) for i in range(len(pairs))], device=device)
         for worlds in WORLDS:
             poses = np.zeros((worlds, len(shapes), 7))
             for i, pair in enumerate(pairs):
                 at = 2 * kinds.index(pair)
-                poses[:, 2 * i : 2 * i + 2] = every.poses[(np.arange(worlds) * 7 + 5 * i) % 128, at : at + 2]
+                poses[:, 2 * i : 2 * i + 2] = given[(np.arange(worlds) * 7 + 5 * i) % VARIED, at : at + 2]
             inputs, outputs, threads = contacts.prepare(poses)
 
             def call(threads: int = threads, inputs: Any = inputs, outputs: Any = outputs) -> None:
@@ -299,7 +304,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         count = options.poses if "hull64" not in pair else max(1, options.poses // MANY)
         made = PairsAtPoses([pair], count)
         for dtype in options.dtype or ("float32", "float64"):
-            rows += made.errors(dtype, options.device)
+            rows += made.errors(made.contacts(dtype, options.device), dtype)
             print(rows[-1], "holds" if rows[-1].holds else "MISSES", flush=True)
     for row in timed(options.device) if options.time else ():
         times.append(row)

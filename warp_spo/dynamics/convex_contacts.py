@@ -71,12 +71,18 @@ def shape_rows(call: str, shapes: Sequence[PairShape]) -> ShapeRows:
         ValueError: A kind is none of those, sizes are too many, too few or not above zero, or a hull is flat.
         UnsupportedError: a hull has more than 64 corners.
     """
-    rows, sizes, middles = [], np.zeros((len(shapes), 4)), np.zeros((len(shapes), 3))
+    rows: list[tuple[int, ...]] = []
+    sizes, middles = np.zeros((len(shapes), 4)), np.zeros((len(shapes), 3))
     corners: list[np.ndarray] = []
     planes: list[np.ndarray] = []
     starts, loops = [0], list[int]()
+    known: dict[int, int] = {}
     for number, shape in enumerate(shapes):
-        name = f"{call}: shape {number}"
+        name, same = f"{call}: shape {number}", known.setdefault(id(shape), number)
+        if same < number:
+            rows.append(rows[same])
+            sizes[number], middles[number] = sizes[same], middles[same]
+            continue
         if shape.kind not in KINDS:
             raise ValueError(f"{name} is a {shape.kind!r}; expected one of {', '.join(KINDS)}")
         first, first_face = sum(map(len, corners)), len(starts) - 1
