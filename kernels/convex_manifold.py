@@ -7,7 +7,8 @@ the one farthest from it, and on both sides of these the one that spans most. Se
 point and both ends of the part that they share; all else has one point.
 """
 
-RAW = 24  # corners of two faces with LARGEST_FACE each
+RAW = {"convex": 24, "on_plane": 13, "boxes": 8}
+"""Corners of a polygon at most: those of two faces with LARGEST_FACE each, of one and the deepest, of two boxes."""
 
 NATIVE = r"""
     // Where the points of a pair go: [point, (place 3, normal 3, depth)], in axes in which the first shape has a pose.
@@ -252,8 +253,8 @@ NATIVE = r"""
         Polygon polygon;
         polygon.count = 0;
         if ((second ? g.flat : f.flat) > (REAL)FLAT && (second ? f.count : g.count) > 1) {
-            Feature& face = second ? g : f;
-            const Feature& cut = second ? f : g;
+            Feature face = second ? g : f;
+            const Feature cut = second ? f : g;
             REAL deepest = -1;
             UNROLL
             for (int r = 0; r < 3; ++r) polygon.normal[r] = face.normal[r];

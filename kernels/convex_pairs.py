@@ -35,8 +35,8 @@ NUMBERS = {
     "NONE": 1e9,  # overlap of directions that are not there [m]
 }
 WHOLE = {
-    "LARGEST_FACE": convex_shapes.LARGEST_FACE, "RAW": convex_manifold.RAW, "POINTS": POINTS, "ENTRY": ENTRY,
-    "TURNS": TURNS, "ROW": ROW, "SIZES": SIZES, "POSE": POSE,
+    "LARGEST_FACE": convex_shapes.LARGEST_FACE, "POINTS": POINTS, "ENTRY": ENTRY, "TURNS": TURNS, "ROW": ROW,
+    "SIZES": SIZES, "POSE": POSE,
 }  # fmt: skip
 
 
@@ -58,10 +58,10 @@ TABLE = {(KINDS[i], KINDS[j]): ROUTINES[routine(i, j)] for j in range(PLANE + 1)
 """The routine of each pair of kinds, the lower one first."""
 
 COLLIDE = r"""
-    // Puts the points of two shapes at poses (place, quaternion xyzw); returns how many there are. ``reach``: how far
-    // apart points may be that count.
-    static CUDA_CALLABLE inline int collide(const Shape& one, const Shape& other, const Tables& tables,
-        const REAL* pose, const REAL* other_pose, REAL reach, REAL* to)
+    // Puts the points of two shapes, each with its place [3] and rotation matrix [9]; returns how many there are.
+    // ``reach``: how far apart points may be that count.
+    static CUDA_CALLABLE inline int collide(const Shape& one, const Shape& other, const Tables& tables, const REAL* at,
+        const REAL* turn_of, const REAL* other_at, const REAL* other_turn_of, REAL reach, REAL* to)
     {
         // the lower kind comes first
         const bool swap = one.kind > other.kind;
@@ -69,12 +69,17 @@ COLLIDE = r"""
         two.a = swap ? other : one;
         two.b = swap ? one : other;
         two.tables = tables;
-        const REAL *here = swap ? other_pose : pose, *there = swap ? pose : other_pose;
-        REAL turn[9], other_turn[9], apart[3];
-        rotation(here + 3, turn);
-        rotation(there + 3, other_turn);
+        REAL turn[9], other_turn[9], here[3], apart[3];
         UNROLL
-        for (int r = 0; r < 3; ++r) apart[r] = there[r] - here[r];
+        for (int i = 0; i < 9; ++i) {
+            turn[i] = swap ? other_turn_of[i] : turn_of[i];
+            other_turn[i] = swap ? turn_of[i] : other_turn_of[i];
+        }
+        UNROLL
+        for (int r = 0; r < 3; ++r) {
+            here[r] = swap ? other_at[r] : at[r];
+            apart[r] = swap ? at[r] - other_at[r] : other_at[r] - at[r];
+        }
         turned_back(turn, apart, two.at);
         UNROLL
         for (int i = 0; i < 3; ++i)
@@ -134,15 +139,18 @@ counts.data[place] = 0;
 if (numbers[0] < 0) return;
 const convex::Tables tables = {corners.data, planes.data, face_starts.data, face_corners.data};
 convex::Shape shape[2];
-const REAL* pose[2];
+REAL at[2][3], turn[2][9];
 UNROLL
 for (int k = 0; k < 2; ++k) {
     const int* row = shape_rows.data + ROW * numbers[k];
     const REAL* size = sizes.data + SIZES * numbers[k];
     shape[k] = {row[0], row[1], row[2], row[3], row[4], {size[0], size[1], size[2]}, size[3]};
-    pose[k] = poses.data + POSE * (world * shapes + numbers[k]);
+    const REAL* pose = poses.data + POSE * (world * shapes + numbers[k]);
+    UNROLL
+    for (int r = 0; r < 3; ++r) at[k][r] = pose[r];
+    convex::rotation(pose + 3, turn[k]);
 }
-counts.data[place] = convex::collide(shape[0], shape[1], tables, pose[0], pose[1], reach,
+counts.data[place] = convex::collide(shape[0], shape[1], tables, at[0], turn[0], at[1], turn[1], reach,
     points_out.data + POINTS * ENTRY * place);
 """
 
@@ -163,6 +171,7 @@ def _for_scalars(text: str, T: type, routines: Any) -> str:
         "REAL": C_TYPE[T], "UNROLL": "#pragma unroll", "LOOP": "#pragma unroll 1",
     }  # fmt: skip
     words |= {name: str(value) for name, value in WHOLE.items()}
+    words["RAW"] = str(max((most for name, most in convex_manifold.RAW.items() if name in routines), default=1))
     return re.sub(rf"\b({'|'.join(words)})\b", lambda found: words[found[0]], text)
 
 
