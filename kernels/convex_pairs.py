@@ -95,11 +95,11 @@ COLLIDE = r"""
         Least best;
         bool near = false;
         IF_ROUND if (two.b.kind <= CAPSULE) return put_rounds(two, most, sink); else
-        IF_BALL_ON_BOX if (two.a.kind == SPHERE && two.b.kind == BOX) near = ball_on_box(two, most, best); else
+        IF_BALL_ON_BOX if (two.a.kind == SPHERE && two.b.kind == BOX) return put_ball(two, most, sink); else
         IF_BOXES if (two.a.kind == BOX && two.b.kind == BOX) near = boxes(two, most, best); else
         IF_CONVEX near = search(two, most, best);
         ;
-        if (near) manifold(two, best, sink);
+        IF_FACES if (near) manifold(two, best, sink);
         return sink.count;
     }
 
@@ -113,6 +113,13 @@ COLLIDE = r"""
         Feature f = facing(two.a, two.tables, along), g = facing(two.b, two.tables, along);
         g.move(two.turn, two.at);
         put_ends(two, best, f, g, sink);
+        return sink.count;
+    }
+
+    static CUDA_CALLABLE inline int put_ball(const Two& two, REAL most, Sink& sink)
+    {
+        Least best;
+        if (ball_on_box(two, most, best)) put_deepest(two, best, sink);
         return sink.count;
     }
 
@@ -162,9 +169,10 @@ def definition(T: type, routines: Any = ROUTINES) -> str:
 
 
 def _for_scalars(text: str, T: type, routines: Any) -> str:
-    for name in ROUTINES:
+    there = [*routines, *(["faces"] if "boxes" in routines or "convex" in routines else [])]
+    for name in (*ROUTINES, "faces"):
         mark = f"IF_{name.upper()} "
-        text = text.replace(mark, "") if name in routines else re.sub(rf"\n *{mark}.*", "", text)
+        text = text.replace(mark, "") if name in there else re.sub(rf"\n *{mark}.*", "", text)
     number = "f" if T is wp.float32 else ""
     words = {name: f"{value!r}{number}" for name, value in NUMBERS.items()} | {
         "CLOSE": f"{CLOSE[T]!r}{number}", "SETTLED": f"{SETTLED[T]!r}{number}", "STEPS": str(STEPS[T]),

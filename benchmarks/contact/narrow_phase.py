@@ -281,9 +281,9 @@ def timed(device: str, near: int = 24) -> Iterator[dict[str, Any]]:
             took = []
             for _ in range(REPEATS):
                 begin, end = (wp.Event(device, enable_timing=True) for _ in range(2))
-                wp.record_event(begin)
+                wp.get_stream(device).record_event(begin)
                 wp.capture_launch(capture.graph)
-                wp.record_event(end)
+                wp.get_stream(device).record_event(end)
                 took.append(wp.get_event_elapsed_time(begin, end) * 1e3 / LAUNCHES)
             yield {
                 "pair": name, "near": len(pairs), "worlds": worlds, "us": round(float(np.median(took)), 1),
