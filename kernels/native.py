@@ -15,7 +15,18 @@ const long long thread = index;
 #endif
 """
 """The number of the thread, in 64 bits. On CUDA it needs a grid of one axis, as ``runtime.launches`` gives."""
-INTEGERS = ("place", "shifts", "status", "block_entries")  # names of the arrays that hold integers; each has one axis
+INTEGERS = (
+    "place",
+    "shifts",
+    "status",
+    "block_entries",
+    "near_pairs",
+    "shape_rows",
+    "face_starts",
+    "face_corners",
+    "counts",
+)
+"""Names of the arrays that hold integers; each has one axis."""
 
 
 def function(name: str, native: str, arguments: dict[str, type], result: type | None = None) -> wp.Function:

@@ -46,22 +46,22 @@ class Hull(NamedTuple):
         return tuple(found)
 
 
-def convex_hull(call: str, points: np.ndarray, known: np.ndarray) -> tuple[Hull, np.ndarray]:
+def convex_hull(call: str, points: np.ndarray, known: np.ndarray, most: int = MOST) -> tuple[Hull, np.ndarray]:
     """Return the hull of points [point, 3], and its middle [3].
 
     Args:
-        call: for errors. known: some of the points, which lie on the hull [point, 3].
+        call: for errors. known: some of the points, which lie on the hull [point, 3]. most: faces at most.
 
     Raises:
         ValueError: the points lie in a plane, or some are too near to each other to tell faces apart.
-        UnsupportedError: there are more than MOST corners or faces.
+        UnsupportedError: there are more than MOST corners, or more than ``most`` faces.
     """
     middle, corners, normals, offsets = _corners_and_faces(call, points, known)
     size = float(np.ptp(points, axis=0).max())
     on = np.abs(corners @ normals.T - offsets) <= SAME * size
     faces = [_around(corners, np.flatnonzero(row), normal) for row, normal in zip(on.T, normals, strict=True)]
-    if len(faces) > MOST:
-        raise _too_many(call, f"{len(faces)} faces, more than {MOST}")
+    if len(faces) > most:
+        raise _too_many(call, f"{len(faces)} faces, more than {most}")
     edges = [pair for face in faces for pair in zip(face, [*face[1:], face[0]], strict=True)]
     if len(set(edges)) < len(edges) or {(b, a) for a, b in edges} != set(edges):
         raise ValueError(
