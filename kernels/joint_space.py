@@ -23,7 +23,7 @@ from .elementary import C_TYPE, FUSED
 
 BLOCK = 32  # threads of a block: a warp
 MOST, POINT = 8, 7  # points of a near pair; entries of a point: place, normal towards the first body, depth
-DOF_FIELDS, SLOT_FIELDS = 11, 11
+DOF_FIELDS, SLOT_FIELDS = 12, 11
 DOF_VALUES = (
     "stiffness", "rest", "damping", "ke", "kd", "effort", "dry", "fastest", "brake", "weight",
     "lower", "upper", "limit_ke", "limit_kd", "linear", "angular", "axis_x", "axis_y", "axis_z", "x", "y", "z",
@@ -66,7 +66,8 @@ class Sizes(NamedTuple):
         sizes = {
             "DOF_OF": 2 * self.tiles, "ENTRY": self.entries, "MASK": 2 * self.tiles,
             "COUPLE": (1 + self.columns) * self.couples, "PAIR": 2 * self.pairs, "AXIS_BODY": self.dofs,
-            "POINT_BODY": self.dofs, "COORDINATE": self.dofs,
+            "POINT_BODY": self.dofs, "COORDINATE": self.dofs, "ROW_START": 2 * self.tiles + 1,
+            "ROW": 2 * self.entries - self.dofs,
         }  # fmt: skip
         starts, at = {}, 0
         for name, size in sizes.items():
@@ -100,8 +101,9 @@ def world_bytes(sizes: Sizes, T: type) -> int:
 
 
 @functools.cache
-def solver(sizes: Sizes, T: type, lanes: int = 32, registers: int | None = None) -> wp.Kernel:
-    """Return the kernel of a step; ``lanes`` of 8, 16 or 32 threads of a warp take a world on CUDA.
+def solver(sizes: Sizes, T: type, lanes: int = 32, registers: int | None = None, refine: int = 1) -> wp.Kernel:
+    """Return the kernel of a step; ``lanes`` of 8, 16 or 32 threads of a warp take a world on CUDA. ``refine``: steps of
+    iterative refinement in the last pass.
 
     It launches ``lanes * worlds`` threads on CUDA, ``worlds`` on the CPU, in blocks of BLOCK.
     """
@@ -110,7 +112,7 @@ def solver(sizes: Sizes, T: type, lanes: int = 32, registers: int | None = None)
         "DOFS": sizes.dofs, "N": 2 * sizes.tiles, "NB": sizes.tiles, "NNZ": sizes.entries, "PAIRS": sizes.pairs,
         "MB": sizes.columns, "NEAR": sizes.near, "S": sizes.slots, "BYTES": size, "MOST": MOST, "POINT": POINT,
         "DV": len(DOF_VALUES), "PV": len(PAIR_VALUES), "TILES": sizes.tiles * (sizes.tiles + 1) // 2 + sizes.tiles,
-        "CROWDED": 1,
+        "CROWDED": 1, "REFINE": refine,
     }  # fmt: skip
     constants |= starts | {f"T_{name}": at for name, at in sizes.table_starts.items()}
     constants |= {f"C_{name.upper()}": i for i, name in enumerate(DOF_VALUES)}
@@ -137,7 +139,7 @@ enum { CONSTANTS };
 #define ANY(x) (x)
 #endif
 #define EACH(i, n) for (int i = lane; i < (n); i += LANES)
-struct alignas(4 * sizeof(REAL)) Tile { REAL x[4]; };  // rows of a 2 x 2 block
+struct alignas(16) Tile { REAL x[4]; };  // rows of a 2 x 2 block
 struct alignas(2 * sizeof(REAL)) Two { REAL x, y; };
 struct joint_space
 {
@@ -193,6 +195,17 @@ struct joint_space
         for (int c = 0; c < 3; ++c) y[c] = x[c] + 2 * FMA(pose[6], t[c], u[c]);
     }
 
+    // Adds what a point's force does to two dofs.
+    static CUDA_CALLABLE inline void push(const REAL* J, const REAL* f, int apart, REAL* sum)
+    {
+        UNROLL
+        for (int r = 0; r < 3; ++r) {
+            const Two one = *(const Two*)(J + 2 * r);
+            sum[0] = FMA(one.x, f[r * apart], sum[0]);
+            sum[1] = FMA(one.y, f[r * apart], sum[1]);
+        }
+    }
+
     // Two unit vectors across a normal.
     static CUDA_CALLABLE inline void tangents(const REAL* n, REAL* one, REAL* other)
     {
@@ -216,7 +229,7 @@ const long long world = alive ? number_of_world : worlds - 1;
 extern __shared__ char dynamic_smem_base[];
 char* const bytes = dynamic_smem_base + (threadIdx.x / LANES) * BYTES;
 #else
-alignas(16) char bytes[BYTES];
+alignas(64) char bytes[BYTES];
 #endif
 REAL* const s = (REAL*)bytes;
 Tile* const A = (Tile*)(s + AT_A);
@@ -226,7 +239,7 @@ int *const run_start = (int*)(bytes + AT_RUN), *const run_couple = run_start + N
 int *const slot_of = (int*)(bytes + AT_SLOT_OF), *const keep = (int*)(bytes + AT_KEEP);
 int* const count = (int*)(bytes + AT_COUNT);
 unsigned char* const rows = (unsigned char*)(bytes + AT_ROWS);
-enum { V0, X, DRIVE, DRY, LOAD, LIMIT, D, R, I0, L10, I1 };
+enum { V0, X, DRIVE, DRY, LOAD, LIMIT, D, R, I0, L10, I1, CHANGE };
 enum { U0, CN = 3, CT, F, DEPTH = 8, ACROSS, FLAG };
 const int* const table = place.data;
 const int* const nears = near.data + world * (1 + 2 * NEAR);
@@ -523,12 +536,7 @@ for (int number = 0;; ++number) {
                     if (along == 0 && across == 0) continue;
                     const Two* const one = (const Two*)(J + (at * MB + b) * 6);
                     if (t >= triangle) {
-                        UNROLL
-                        for (int r = 0; r < 3; ++r) {
-                            const REAL f = slot[(F + r) * S + at];
-                            sum[0] = FMA(one[r].x, f, sum[0]);
-                            sum[1] = FMA(one[r].y, f, sum[1]);
-                        }
+                        joint_space::push(J + (at * MB + b) * 6, slot + F * S + at, S, sum);
                         continue;
                     }
                     const Two* const other = (const Two*)(J + (at * MB + a) * 6);
@@ -589,23 +597,94 @@ for (int number = 0;; ++number) {
         }
         SYNC
     }
-    // -- back substitution
+    // -- back substitution, and in the last pass a step of refinement with the same factor
     LOOP
-    for (int j = NB - 1; j >= 0; --j) {
-        const Tile& y = A[joint_space::tile(NB, j)];
-        const REAL x1 = y.x[1] * dof[I1 * N + j], x0 = FMA(-dof[L10 * N + j], x1, y.x[0]) * dof[I0 * N + j];
-        if (lane == 0) {
-            dof[X * N + 2 * j] = x0;
-            dof[X * N + 2 * j + 1] = x1;
+    for (int refined = 0;; ++refined) {
+        LOOP
+        for (int j = NB - 1; j >= 0; --j) {
+            const Tile& y = A[joint_space::tile(NB, j)];
+            const REAL x1 = y.x[1] * dof[I1 * N + j], x0 = FMA(-dof[L10 * N + j], x1, y.x[0]) * dof[I0 * N + j];
+            if (lane == 0) {
+                dof[CHANGE * N + 2 * j] = x0;
+                dof[CHANGE * N + 2 * j + 1] = x1;
+            }
+            EACH (k, j) {
+                const Tile x = A[joint_space::tile(j, k)];
+                Tile& to = A[joint_space::tile(NB, k)];
+                to.x[0] = FMA(-x.x[2], x1, FMA(-x.x[0], x0, to.x[0]));
+                to.x[1] = FMA(-x.x[3], x1, FMA(-x.x[1], x0, to.x[1]));
+            }
+            SYNC
         }
-        EACH (k, j) {
-            const Tile x = A[joint_space::tile(j, k)];
-            Tile& to = A[joint_space::tile(NB, k)];
-            to.x[0] = FMA(-x.x[2], x1, FMA(-x.x[0], x0, to.x[0]));
-            to.x[1] = FMA(-x.x[3], x1, FMA(-x.x[1], x0, to.x[1]));
+        const bool more = number == pass_count - 1 && refined < REFINE;
+        EACH (i, N) {
+            const REAL x = dof[CHANGE * N + i];
+            dof[X * N + i] = refined ? dof[X * N + i] + x : x;
+            if (!more) continue;
+            REAL left = FMA(-dof[D * N + i], x, dof[R * N + i]);
+            for (int e = table[T_ROW_START + i]; e < table[T_ROW_START + i + 1]; ++e)
+                left = FMA(-held_mass[table[T_ROW + e] >> 8], dof[CHANGE * N + (table[T_ROW + e] & 255)], left);
+            dof[R * N + i] = left;
+            A[joint_space::tile(NB, i >> 1)].x[i & 1] = left;
+        }
+        if (!more) break;
+        EACH (at, slots) {
+            const int* const row = table + T_COUPLE
+                + (1 + MB) * table[T_PAIR + 2 * nears[1 + slot_of[at] / MOST]];
+            REAL u[3] = {0, 0, 0};
+            LOOP
+            for (int c = 0; c < row[0]; ++c) {
+                const Two x = *(const Two*)(dof + CHANGE * N + 2 * (row[1 + c] & 255));
+                UNROLL
+                for (int r = 0; r < 3; ++r) {
+                    const Two each = *(const Two*)(J + (at * MB + c) * 6 + 2 * r);
+                    u[r] = FMA(each.y, x.y, FMA(each.x, x.x, u[r]));
+                }
+            }
+            UNROLL
+            for (int r = 0; r < 3; ++r)
+                slot[(F + r) * S + at] = FMA(-slot[(r ? CT : CN) * S + at], u[r], slot[(F + r) * S + at]);
+        }
+        SYNC
+        LOOP
+        for (int k = 0; ANY(k < runs); ++k) {
+            if (k < runs) {
+                const int* const row = table + T_COUPLE + (1 + MB) * run_couple[k];
+                LOOP
+                EACH (b, row[0]) {
+                    REAL sum[2] = {0, 0};
+                    LOOP
+                    for (int at = run_start[k]; at < run_start[k + 1]; ++at)
+                        joint_space::push(J + (at * MB + b) * 6, slot + F * S + at, S, sum);
+                    Tile& to = A[joint_space::tile(NB, row[1 + b] & 255)];
+                    to.x[0] += sum[0];
+                    to.x[1] += sum[1];
+                }
+            }
+            SYNC
+        }
+        LOOP
+        for (int j = 0; j < NB; ++j) {
+            const int below = count[j] - 1;
+            const unsigned char* const list = rows + j * (NB + 1);
+            Tile& own = A[joint_space::tile(NB, j)];
+            const REAL y0 = own.x[0] * dof[I0 * N + j];
+            const REAL y1 = FMA(-dof[L10 * N + j], y0, own.x[1]) * dof[I1 * N + j];
+            EACH (a, below) {
+                const Tile x = A[joint_space::tile(list[a], j)];
+                Tile& to = A[joint_space::tile(NB, list[a])];
+                to.x[0] = FMA(-x.x[1], y1, FMA(-x.x[0], y0, to.x[0]));
+                to.x[1] = FMA(-x.x[3], y1, FMA(-x.x[2], y0, to.x[1]));
+            }
+            SYNC
+            if (lane == 0) {
+                own.x[0] = y0;
+                own.x[1] = y1;
+            }
         }
         SYNC
     }
+    SYNC
 }
 // -- results
 SYNC

@@ -27,6 +27,7 @@ class JointSpaceStep:
         lanes: threads of a world on a GPU: 8, 16 or 32; None: by the number of worlds.
         registers: of a thread at most; None: as the compiler chooses.
         margin: how near shapes and points must be to be looked at [m].
+        refine: steps of iterative refinement in the last pass; None: one in float32.
     """
 
     def __init__(
@@ -37,6 +38,7 @@ class JointSpaceStep:
         lanes: int | None = None,
         registers: int | None = None,
         margin: float = MARGIN,
+        refine: int | None = None,
     ):
         self.dyn, scene, T = dyn, dyn.scene, dyn.dtype
         self.near_count, self.margin, self.device, self.worlds = near, margin, dyn.device, dyn.worlds
@@ -62,7 +64,7 @@ class JointSpaceStep:
             push[..., :3] = -(lift * mass)[:, None] * gravity
             self.lift = array(push)
         self.half_gravity = 0.5 * float(np.linalg.norm(gravity))
-        self.solver = joint_space.solver(sizes, T, self.lanes, registers)
+        self.solver = joint_space.solver(sizes, T, self.lanes, registers, int(T is wp.float32) if refine is None else refine)
         self.broad = near_pairs.broad(sizes.pairs, near, T)
         self.narrow = near_pairs.narrow(sizes.pairs, near, T, tables.hulls, tables.long, tables.faces)
 

@@ -64,11 +64,16 @@ def joint_tables(scene: Scene, pattern: tuple[np.ndarray, np.ndarray], near: int
     for pair in pairs:
         table += [couples[_bodies(scene, pair)], pair]
     table += [*axis_body, *point_body, *coordinate]
+    met: list[list[int]] = [[] for _ in order]  # entry and the other dof, of each dof
+    for entry, both in enumerate(zip(rows.tolist(), cols.tolist(), strict=True)):
+        for i, j in {tuple(both), tuple(both[::-1])}:
+            met[position[i]].append(entry << 8 | position[j])
+    table += [*np.cumsum([0, *map(len, met)]).tolist(), *(x for row in met for x in sorted(row))]
     assert len(table) == sizes.table_starts["END"]
-    which, sides, met = _shapes(scene, pairs)
+    which, sides, solids = _shapes(scene, pairs)
     return JointTables(
         sizes, np.array(table, dtype=np.int64).astype(np.uint32).view(np.int32), np.ravel(dof_values),
-        np.ravel(_pair_values(scene, pairs)), which, sides, *met,
+        np.ravel(_pair_values(scene, pairs)), which, sides, *solids,
     )  # fmt: skip
 
 
