@@ -122,9 +122,7 @@ def solver(sizes: Sizes, T: type, lanes: int = 32, registers: int | None = None,
     text = text.replace("UNROLL\n", "#pragma unroll\n").replace("LOOP\n", "#pragma unroll 1\n")
     text = text.replace("LANE_COUNT", str(lanes)).replace("REAL", c).replace("FMA(", f"FUSED_{c}(")
     text = text.replace("INVERSE_ROOT(", "rsqrtf(" if T is wp.float32 else "rsqrt(")
-    return native.kernel(
-        "joint_space", FUSED + text, ARGUMENTS, T, registers=registers, shared=size * (BLOCK // lanes)
-    )
+    return native.kernel("joint_space", FUSED + text, ARGUMENTS, T, registers=registers, shared=size * (BLOCK // lanes))
 
 
 FUNCTIONS = r"""

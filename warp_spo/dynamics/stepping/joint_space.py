@@ -15,7 +15,7 @@ from ...runtime import launches
 if TYPE_CHECKING:
     from ..dynamics import Dynamics
 
-MARGIN = 0.02  # how near shapes and points must be to be looked at [m]
+MARGIN = 5e-3  # how near shapes and points must be to be looked at [m]
 
 
 class JointSpaceStep:
@@ -64,7 +64,9 @@ class JointSpaceStep:
             push[..., :3] = -(lift * mass)[:, None] * gravity
             self.lift = array(push)
         self.half_gravity = 0.5 * float(np.linalg.norm(gravity))
-        self.solver = joint_space.solver(sizes, T, self.lanes, registers, int(T is wp.float32) if refine is None else refine)
+        self.solver = joint_space.solver(
+            sizes, T, self.lanes, registers, int(T is wp.float32) if refine is None else refine
+        )
         self.broad = near_pairs.broad(sizes.pairs, near, T)
         self.narrow = near_pairs.narrow(sizes.pairs, near, T, tables.hulls, tables.long, tables.faces)
 

@@ -158,9 +158,7 @@ def _couples(
     return couples, columns
 
 
-def _entries(
-    rows: np.ndarray, cols: np.ndarray, position: dict[int, int], tiles: int
-) -> tuple[list[int], list[int]]:
+def _entries(rows: np.ndarray, cols: np.ndarray, position: dict[int, int], tiles: int) -> tuple[list[int], list[int]]:
     """Return where each entry of the mass matrix goes, diagonal ones as ~place, and which tiles a column has."""
     entries, masks = [], [0] * tiles
     for row, col in zip(rows.tolist(), cols.tolist(), strict=True):
