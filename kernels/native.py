@@ -15,7 +15,13 @@ const long long thread = index;
 #endif
 """
 """The number of the thread, in 64 bits. On CUDA it needs a grid of one axis, as ``runtime.launches`` gives."""
-INTEGERS = ("place", "shifts", "status", "block_entries", "near")  # names of the arrays that hold integers; each has one axis
+INTEGERS = (
+    "place",
+    "shifts",
+    "status",
+    "block_entries",
+    "near",
+)  # names of the arrays that hold integers; each has one axis
 
 
 def function(name: str, native: str, arguments: dict[str, type], result: type | None = None) -> wp.Function:

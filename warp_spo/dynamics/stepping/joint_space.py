@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from ...recursions.contact.pairs import PASSES
 from ...runtime import launches
 
 if TYPE_CHECKING:
+    from ...scene.scene import Scene
     from ..dynamics import Dynamics
 
 MARGIN = 5e-3  # how near shapes and points must be to be looked at [m]
@@ -40,13 +42,16 @@ class JointSpaceStep:
         margin: float = MARGIN,
         refine: int | None = None,
     ):
-        self.dyn, scene, T = dyn, dyn.scene, dyn.dtype
+        scene: Scene = dyn.scene
+        T: Any = dyn.dtype
+        self.dyn = dyn
         self.near_count, self.margin, self.device, self.worlds = near, margin, dyn.device, dyn.worlds
         self.lanes = lanes or (32 if dyn.worlds <= 8192 else 16)
         pattern = dyn.mass_matrix_pattern
         self.tables = tables = joint_tables(scene, pattern, near, slots)
-        sizes, array = tables.sizes, lambda values, dtype=T: wp.array(values, dtype=dtype, device=self.device)
-        self.place, self.which = array(tables.place, int), array(tables.which, int)
+        sizes = tables.sizes
+        array = functools.partial(wp.array, dtype=T, device=self.device)
+        self.place, self.which = array(tables.place, dtype=int), array(tables.which, dtype=int)
         self.dof_values, self.pair_values = array(tables.dof_values), array(tables.pair_values)
         self.sides = array(tables.sides)
         make = lambda *shape, dtype=T: wp.zeros(shape, dtype=dtype, device=self.device)  # noqa: E731
