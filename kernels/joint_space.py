@@ -34,13 +34,15 @@ PAIR_VALUES = ("stiffness", "damping", "friction", "eps", "weight")
 NUMBERS = ("h", "passes", "half_gravity", "margin")
 ARGUMENTS = [
     ("mass", 2), ("bias", 2), ("tau", 2), ("q", 2), ("qd", 2), ("target_q", 2), ("target_qd", 2), ("poses", 3),
-    ("near", 1),    ("touches", 2), ("dof_values", 1), ("pair_values", 1), ("place", 1), *((name, 0) for name in NUMBERS),
+    ("near", 1), ("touches", 2), ("dof_values", 1), ("pair_values", 1), ("place", 1),
+    *((name, 0) for name in NUMBERS),
     ("out", 2), ("contact_f", 3), ("excess", 2), ("status", 1),
 ]  # fmt: skip
 """Names and numbers of axes.
 
 ``bias``, ``tau`` [world, dof]: the bias force, and the hinges' forces.
-``near`` [world * (1 + 2 near pairs)]: how many pairs are near, which ones, and how many points each has."""
+``near`` [world * (1 + 2 near pairs)]: how many pairs are near, which ones, and how many points each has.
+"""
 
 
 class Sizes(NamedTuple):

@@ -50,7 +50,7 @@ class JointSpaceStep:
         pattern = dyn.mass_matrix_pattern
         self.tables = tables = joint_tables(scene, pattern, near, slots)
         sizes = tables.sizes
-        array = functools.partial(wp.array, dtype=T, device=self.device)
+        array: Any = functools.partial(wp.array, dtype=T, device=self.device)
         self.place, self.which = array(tables.place, dtype=int), array(tables.which, dtype=int)
         self.dof_values, self.pair_values = array(tables.dof_values), array(tables.pair_values)
         self.sides = array(tables.sides)
@@ -63,7 +63,8 @@ class JointSpaceStep:
         self.qd_out, self.excess = make(self.worlds, n), make(self.worlds, 3)
         self.contact_f, self.status = make(self.worlds, scene.contact_count, 3), make(self.worlds, dtype=int)
         lift, mass = scene.values["body_gravcomp"][0], scene.values["body_mass"][0]
-        gravity, self.lift = scene.values["gravity"][0], None
+        gravity = scene.values["gravity"][0]
+        self.lift: wp.array | None = None
         if lift.any():
             push = np.zeros((self.worlds, scene.body_count, 6))
             push[..., :3] = -(lift * mass)[:, None] * gravity
