@@ -49,6 +49,7 @@ for (int number = 0;; ++number) {
                 slot[F * S + at] = normal;
                 slot[(F + 1) * S + at] = -across * u[1];
                 slot[(F + 2) * S + at] = -across * u[2];
+                slot[ACROSS * S + at] = slip;
                 continue;
             }
         }
@@ -321,25 +322,35 @@ if (alive) {
         const int own = table[T_DOF_OF + i];
         if (own >= 0) out.data[world * DOFS + own] = dof[V0 * N + i] + dof[X * N + i];
     }
-    EACH (e, 3 * PAIRS)
-        contact_f.data[(world * contact_f.shape[1] + table[T_PAIR + 2 * (e / 3) + 1]) * 3 + e % 3] = 0;
+    EACH (k, PAIRS) {
+        const long long row = world * contact_f.shape[1] + table[T_PAIR + 2 * k + 1];
+        for (int c = 0; c < 3; ++c) contact_f.data[row * 3 + c] = 0;
+        contact_gap.data[row] = AWAY;
+        contact_slip.data[row] = 0;
+    }
 }
 SYNC
 if (alive) {
     EACH (k, number_near) {
         if (nears[1 + k] < 0) continue;
-        REAL f[3] = {0, 0, 0};
+        REAL f[3] = {0, 0, 0}, deepest = -AWAY, slip = 0;
         for (int at = 0; at < slots; ++at) {
             const int where = slot_of[at];
             if (where / MOST != k) continue;
+            if (slot[DEPTH * S + at] > deepest) {
+                deepest = slot[DEPTH * S + at];
+                slip = slot[ACROSS * S + at];
+            }
             REAL axes[9];
             for (int r = 0; r < 3; ++r) axes[r] = touch[where * POINT + 3 + r];
             joint_space::tangents(axes, axes + 3, axes + 6);
             for (int r = 0; r < 3; ++r)
                 for (int c = 0; c < 3; ++c) f[c] = FMA(axes[3 * r + c], slot[(F + r) * S + at], f[c]);
         }
-        const int row = table[T_PAIR + 2 * nears[1 + k] + 1];
-        for (int c = 0; c < 3; ++c) contact_f.data[(world * contact_f.shape[1] + row) * 3 + c] = f[c];
+        const long long row = world * contact_f.shape[1] + table[T_PAIR + 2 * nears[1 + k] + 1];
+        for (int c = 0; c < 3; ++c) contact_f.data[row * 3 + c] = f[c];
+        contact_gap.data[row] = -deepest;
+        contact_slip.data[row] = slip;
     }
     if (lane == 0) {
         for (int e = 0; e < 3; ++e) {

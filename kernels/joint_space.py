@@ -22,6 +22,7 @@ from . import joint_passes, joint_points, native
 from .elementary import C_TYPE, FUSED
 
 SLOTS = 9  # as warp_spo.Status, which kernels cannot import; a test compares
+AWAY = 1e3  # gap of pairs that are not near [m]
 BLOCK = 32  # threads of a block: a warp
 MOST, POINT = 8, 7  # points of a near pair; entries of a point: place, normal towards the first body, depth
 DOF_FIELDS, SLOT_FIELDS = 12, 11
@@ -36,7 +37,7 @@ ARGUMENTS = [
     ("mass", 2), ("bias", 2), ("tau", 2), ("q", 2), ("qd", 2), ("target_q", 2), ("target_qd", 2), ("poses", 3),
     ("near", 1), ("touches", 2), ("dof_values", 1), ("pair_values", 1), ("place", 1),
     *((name, 0) for name in NUMBERS),
-    ("out", 2), ("contact_f", 3), ("excess", 2), ("status", 1),
+    ("out", 2), ("contact_f", 3), ("contact_gap", 2), ("contact_slip", 2), ("excess", 2), ("status", 1),
 ]  # fmt: skip
 """Names and numbers of axes.
 
@@ -126,6 +127,11 @@ def solver(sizes: Sizes, T: type, lanes: int = 32, registers: int | None = None,
         "CONSTANTS", ", ".join(f"{name} = {x}" for name, x in constants.items())
     )
     text = text.replace("UNROLL\n", "#pragma unroll\n").replace("LOOP\n", "#pragma unroll 1\n")
-    text = text.replace("LANE_COUNT", str(lanes)).replace("REAL", c).replace("FMA(", f"FUSED_{c}(")
+    text = (
+        text.replace("AWAY", f"(REAL){AWAY}")
+        .replace("LANE_COUNT", str(lanes))
+        .replace("REAL", c)
+        .replace("FMA(", f"FUSED_{c}(")
+    )
     text = text.replace("INVERSE_ROOT(", "rsqrtf(" if T is wp.float32 else "rsqrt(")
     return native.kernel("joint_space", FUSED + text, ARGUMENTS, T, registers=registers, shared=size * (BLOCK // lanes))

@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 
 import warp_spo as spo
+from support import pair_scenes
 from support.pair_scenes import H, box, cube, free, mixed, mixed_states
 from warp_spo.dynamics.stepping.joint_space import JointSpaceStep
 from warp_spo.errors import UnsupportedError
@@ -172,3 +173,25 @@ def test_hinges_without_an_axis_are_refused():
     other = spo.Scene(scene.bodies, hinges, contacts=scene.contacts[1:])
     with pytest.raises(UnsupportedError, match="universal hinges where bodies touch in joint space"):
         JointSpaceStep(spo.Dynamics(other, 1, "cpu"))
+
+
+def test_a_step_of_dynamics_reports_the_same(device):
+    """The step with all reports, of a Dynamics that solves its pairs in joint space."""
+    solver, (q, qd, _) = made("arms", 4, str(device), "float64")
+    dyn = solver.dyn
+    try:
+        dyn._joint_space = solver
+        found = pair_scenes.stepped(dyn, q, qd)
+    finally:
+        dyn._joint_space = None
+    for w in range(4):
+        at = PairStep(dyn.scene, q[w], qd[w], H)
+        after, wanted = at.run(passes=4)
+        f, gap, slip = at.reports(wanted)
+        near = found["contact_gap"][w] < joint_space.AWAY
+        assert near.sum() >= 2 and (gap[~near] > 0.0).all()
+        np.testing.assert_allclose(found["q"][w], after, atol=EXACT)
+        np.testing.assert_allclose(found["contact_f"][w], f, atol=EXACT * np.abs(wanted.f).max())
+        np.testing.assert_allclose(found["contact_gap"][w, near], gap[near], atol=EXACT)
+        np.testing.assert_allclose(found["contact_slip"][w, near], slip[near], atol=EXACT)
+        assert found["status"][w] == spo.Status.OK

@@ -8,15 +8,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from ...errors import UnsupportedError
+from ...execution.routine import Routine
 from ...kernels import joint_space, near_pairs
+from ...recursions import coordinates
 from ...recursions.contact.joint_tables import joint_tables
 from ...recursions.contact.pairs import PASSES
 from ...runtime import launches
+from ..inertia import MASS_MATRIX_PACKED
+from ..inverse_dynamics import BIAS_FORCE
+from ..kinematics import BODY_POSES
 
 if TYPE_CHECKING:
     from ...scene.scene import Scene
     from ..dynamics import Dynamics
 
+INTEGRATE = Routine("integrate", coordinates.integrate)
 MARGIN = 5e-3  # how near shapes and points must be to be looked at [m]
 
 
@@ -58,10 +65,12 @@ class JointSpaceStep:
         self.near = make(self.worlds * (1 + 2 * near), dtype=int)
         self.touches = make(self.worlds, near * joint_space.MOST * joint_space.POINT)
         n = scene.dof_count
+        self.neutral = array(np.tile(scene.neutral_q, (self.worlds, 1)))
         self.mass, self.poses = make(self.worlds, len(pattern[0])), make(self.worlds, scene.body_count, 7)
         self.bias, self.still = make(self.worlds, n), make(self.worlds, n)
         self.qd_out, self.excess = make(self.worlds, n), make(self.worlds, 3)
         self.contact_f, self.status = make(self.worlds, scene.contact_count, 3), make(self.worlds, dtype=int)
+        self.contact_gap, self.contact_slip = (make(self.worlds, scene.contact_count) for _ in range(2))
         lift, mass = scene.values["body_gravcomp"][0], scene.values["body_mass"][0]
         gravity = scene.values["gravity"][0]
         self.lift: wp.array | None = None
@@ -99,16 +108,17 @@ class JointSpaceStep:
         tau, (target_q, target_qd) = self.still if tau is None else tau, targets
         system = [self.mass, self.bias, tau, q, qd, target_q, self.still if target_qd is None else target_qd]
         system += [self.poses, self.near, self.touches, self.dof_values, self.pair_values, self.place]
-        out = [self.qd_out, self.contact_f, self.excess, self.status]
+        out = [self.qd_out, self.contact_f, self.contact_gap, self.contact_slip, self.excess, self.status]
         a_world = self.lanes if self.device.is_cuda else 1
         numbers = [dt, float(passes), self.half_gravity, self.margin]
         self._launch(self.solver, a_world * self.worlds, system + numbers, out, joint_space.BLOCK)
 
     def find_system(self, q: wp.array, qd: wp.array) -> None:
         """Compute mass, poses and bias of a state."""
-        self.dyn.mass_matrix_packed(q, out=self.mass)
-        self.dyn.body_poses(q, out=self.poses)
-        self.dyn.bias_force(q, qd, self.lift, out=self.bias)
+        launch = self.dyn._engine.launch
+        launch(MASS_MATRIX_PACKED, self.mass, q=q)
+        launch(BODY_POSES, self.poses, q=q)
+        launch(BIAS_FORCE, self.bias, q=q, qd=qd, body_f=self.lift)
 
     def step(
         self,
@@ -125,5 +135,35 @@ class JointSpaceStep:
         self.find_points()
         self.solve(q, qd, tau, targets, dt, passes)
         if q_out is not None:
-            self.dyn.integrate(q, self.qd_out, dt, out=q_out)
+            self.dyn._engine.launch_routine(INTEGRATE, q_out, q=q, qd=self.qd_out, dt=dt)
         return self.qd_out
+
+    def launch(
+        self,
+        q: wp.array,
+        qd: wp.array,
+        after: tuple[wp.array, wp.array],
+        dt: float,
+        passes: int,
+        further: dict[str, wp.array],
+        tau: wp.array | None = None,
+        target_q: wp.array | None = None,
+        target_qd: wp.array | None = None,
+        **given: Any,
+    ) -> None:
+        """Launch the step of :meth:`Dynamics.step`; ``after``: arrays for q and qd, ``further``: others by name."""
+        for name, value in given.items():
+            if value is not None:
+                raise UnsupportedError("Dynamics.step", f"{name}= where bodies touch in joint space", "leave it out")
+        results = {"contact_f": self.contact_f, "contact_gap": self.contact_gap, "contact_slip": self.contact_slip,
+                   "contact_excess": self.excess, "status": self.status}  # fmt: skip
+        if lacks := [name for name in further if name not in results]:
+            raise UnsupportedError("Dynamics.step", f"{lacks[0]} where bodies touch in joint space", "leave it out")
+        aim = self.neutral if target_q is None else target_q
+        self.find_system(q, qd)
+        self.find_points()
+        self.solve(q, qd, tau, (aim, target_qd), dt, passes)
+        self.dyn._engine.launch_routine(INTEGRATE, after[0], q=q, qd=self.qd_out, dt=dt)
+        launches.copy(after[1], self.qd_out)
+        for name, array in further.items():
+            launches.copy(array, results[name])
