@@ -9,10 +9,10 @@ import numpy as np
 import warp as wp
 
 from ...errors import UnsupportedError
+from ...execution.joint_tables import joint_tables
 from ...execution.routine import Routine
 from ...kernels import joint_space, near_pairs
 from ...recursions import coordinates
-from ...recursions.contact.joint_tables import joint_tables
 from ...recursions.contact.pairs import PASSES
 from ...runtime import launches
 from ..inertia import MASS_MATRIX_PACKED

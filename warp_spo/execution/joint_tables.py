@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...errors import UnsupportedError
-from ...kernels import joint_space, near_pairs
-from ...scene.parts import UNLIMITED
-from ...scene.scene import Scene
-from ..step.joint_laws import DEFAULT_BOUND, HOLD, neutral_inertias
-from .couples import Polyhedron
-from .pairs import inverse_weights
+from ..errors import UnsupportedError
+from ..kernels import joint_space, near_pairs
+from ..recursions.contact.couples import Polyhedron
+from ..recursions.contact.pairs import inverse_weights
+from ..recursions.step.joint_laws import DEFAULT_BOUND, HOLD, neutral_inertias
+from ..scene.parts import UNLIMITED
+from ..scene.scene import Scene
 
 NONE = 1e30  # a bound that no force or rate reaches
 SIGNS = {-1: 0, 0: 1, 1: 2}  # two bits of a column
