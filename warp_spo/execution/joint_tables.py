@@ -14,6 +14,7 @@ from ..recursions.step.joint_laws import DEFAULT_BOUND, HOLD, neutral_inertias
 from ..scene.parts import UNLIMITED
 from ..scene.scene import Scene
 
+MOST_DOFS = 100  # with those that fill limbs they are 128 at most, the bits of a mask of tiles
 NONE = 1e30  # a bound that no force or rate reaches
 SIGNS = {-1: 0, 0: 1, 1: 2}  # two bits of a column
 
@@ -49,6 +50,9 @@ def joint_tables(scene: Scene, pattern: tuple[np.ndarray, np.ndarray], near: int
     order = _order(scene, dofs_of, ways)
     position = {dof: i for i, dof in enumerate(order) if dof >= 0}
     tiles = len(order) // 2
+    if tiles > 64:
+        what = f"limbs with {len(order)} dofs, each limb's even, more than 128,"
+        raise UnsupportedError("Dynamics.step", f"{what} where bodies touch in joint space", "use another solver")
     couples, columns = _couples(scene, dofs_of, ways, position)
     pairs = sorted(range(len(scene.contact_pairs)), key=lambda i: (couples[_bodies(scene, i)], i))
     rows, cols = pattern
@@ -83,7 +87,7 @@ def _refuse(scene: Scene) -> None:
     lacks = [f"{kind} hinges" for kind in sorted(kinds)]
     lacks += ["hinges that share dofs"] * bool(scene.shares_dofs)
     lacks += ["bodies with modes"] * any(body.modes is not None for body in scene.bodies)
-    lacks += ["more than 128 dofs"] * (scene.dof_count > 120)
+    lacks += [f"{scene.dof_count} dofs, more than {MOST_DOFS},"] * (scene.dof_count > MOST_DOFS)
     if lacks:
         raise UnsupportedError("Dynamics.step", f"{lacks[0]} where bodies touch in joint space", "use another solver")
 

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from ..dynamics import Dynamics
 
 INTEGRATE = Routine("integrate", coordinates.integrate)
+FEW, MOST_SHARED = 8192, 96 * 1024
+"""Worlds up to which each takes a warp; shared memory of a block above which it does, too [bytes]. Not measured yet."""
 MARGIN = 5e-3  # how near shapes and points must be to be looked at [m]
 
 
@@ -53,10 +55,11 @@ class JointSpaceStep:
         T: Any = dyn.dtype
         self.dyn = dyn
         self.near_count, self.margin, self.device, self.worlds = near, margin, dyn.device, dyn.worlds
-        self.lanes = lanes or (32 if dyn.worlds <= 8192 else 16)
         pattern = dyn.mass_matrix_pattern
         self.tables = tables = joint_tables(scene, pattern, near, slots)
         sizes = tables.sizes
+        crowded = 2 * joint_space.world_bytes(sizes, T) > MOST_SHARED
+        self.lanes = lanes or (32 if crowded or dyn.worlds <= FEW else 16)
         array: Any = functools.partial(wp.array, dtype=T, device=self.device)
         self.place, self.which = array(tables.place, dtype=int), array(tables.which, dtype=int)
         self.dof_values, self.pair_values = array(tables.dof_values), array(tables.pair_values)
