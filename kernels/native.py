@@ -20,6 +20,7 @@ INTEGERS = (
     "shifts",
     "status",
     "block_entries",
+    "near",
     "near_pairs",
     "shape_rows",
     "face_starts",

@@ -1,6 +1,7 @@
 """Steps with contacts: times, errors, energy, motions, other engines, gradients, pictures.
 
 ``scenes``: robots on the ground. ``steps``: time and error of a step; ``pairs``: the same where bodies touch bodies.
+``joint_space``: those solved in joint space.
 ``throws``: energy of a million random states. ``defaults``: what rests, stands, holds and creeps on default values.
 ``spinning_contacts``: torsional and rolling friction beside closed forms and MuJoCo, on a CPU.
 ``motions`` and ``courses``: every figure that contacts promise, on a CPU. ``mujoco``: G1 beside MuJoCo, its error

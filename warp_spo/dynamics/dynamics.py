@@ -59,7 +59,7 @@ from .stepping import contact_options
 from .stepping import step as steps
 
 if TYPE_CHECKING:
-    pass
+    from .stepping.joint_space import JointSpaceStep
 
 MOST_WORLDS = 2**31 - 1  # of an axis of a Warp array
 
@@ -259,6 +259,7 @@ class Dynamics:
             raise UnsupportedError("Dynamics", f"refine={count} with loops={loops!r}", "dtype='float64'")
         self.refine = count
         self._refinement = Refinement(self, count) if count else None
+        self._joint_space: JointSpaceStep | None = None  # solves pairs of bodies in place of the sweep's kernels
         self._looks_at_targets = True  # at the first step that is given some: whether a drive follows them
         self._options = {
             "worlds": self.worlds,

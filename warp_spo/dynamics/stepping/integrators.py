@@ -110,6 +110,12 @@ def semi_implicit(
     given |= {SUBSTEPS: float(substeps)} if substeps > 1 else {}
     if dyn.scene.contacts:
         count = float(pairs.default_passes(dyn.scene) if passes is None else passes)
+        if dyn._joint_space is not None:
+            asks = {name.removesuffix("_out"): array for name, array in asked.items()} | (reports or {})
+            dyn._joint_space.launch(q, qd, (q_out, qd_out), dt, int(count), asks, **given)
+            if bodies is not None:
+                write_bodies(dyn, q_out, qd_out, bodies)
+            return
         given |= {"passes": count, "reports": tuple(reports or ()), **option}
         if made := midpoint_contact.count_rounds(dyn.scene, count, rounds):
             midpoint_contact.step(dyn, dt, (q_out, qd_out), more | (reports or {}), q, qd, made, **given)

@@ -1,0 +1,256 @@
+"""Native code of :mod:`.joint_space` before the passes: slots of points, their Jacobians, rows of the matrix."""
+
+FUNCTIONS = r"""
+enum { CONSTANTS };
+#if defined(__CUDA_ARCH__)
+#define LANES LANE_COUNT
+#define SYNC __syncwarp();
+#define ANY(x) __any_sync(0xffffffffu, x)
+#else
+#define LANES 1
+#define SYNC
+#define ANY(x) (x)
+#endif
+#define EACH(i, n) for (int i = lane; i < (n); i += LANES)
+struct alignas(16) Tile { REAL x[4]; };  // rows of a 2 x 2 block
+struct alignas(2 * sizeof(REAL)) Two { REAL x, y; };
+struct joint_space
+{
+    static CUDA_CALLABLE inline REAL inverse_root(REAL x)
+    {
+#if defined(__CUDA_ARCH__)
+        return INVERSE_ROOT(x);
+#else
+        return 1 / sqrt(x);
+#endif
+    }
+
+    static CUDA_CALLABLE inline REAL size_of(REAL x) { return x < 0 ? -x : x; }
+    static CUDA_CALLABLE inline REAL positive(REAL x) { return x > 0 ? x : 0; }
+    static CUDA_CALLABLE inline int tile(int i, int j) { return i * (i + 1) / 2 + j; }
+
+    static CUDA_CALLABLE inline int first_of(unsigned long long mask)
+    {
+#if defined(__CUDA_ARCH__)
+        return __ffsll((long long)mask) - 1;
+#else
+        int i = 0;
+        while (!(mask >> i & 1)) ++i;
+        return i;
+#endif
+    }
+
+    // Row and column of an entry of a triangle, row after row.
+    static CUDA_CALLABLE inline void corner(int t, int& a, int& b)
+    {
+        a = (int)((sqrt((float)(8 * t + 1)) - 1) * 0.5f);
+        b = t - a * (a + 1) / 2;
+    }
+
+    static CUDA_CALLABLE inline void cross(const REAL* a, const REAL* b, REAL* c)
+    {
+        c[0] = FMA(a[1], b[2], -(a[2] * b[1]));
+        c[1] = FMA(a[2], b[0], -(a[0] * b[2]));
+        c[2] = FMA(a[0], b[1], -(a[1] * b[0]));
+    }
+
+    static CUDA_CALLABLE inline REAL dot(const REAL* a, const REAL* b)
+    {
+        return FMA(a[0], b[0], FMA(a[1], b[1], a[2] * b[2]));
+    }
+
+    static CUDA_CALLABLE inline void turn(const REAL* pose, const REAL* x, REAL* y)
+    {
+        REAL t[3], u[3];
+        cross(pose + 3, x, t);
+        cross(pose + 3, t, u);
+        UNROLL
+        for (int c = 0; c < 3; ++c) y[c] = x[c] + 2 * FMA(pose[6], t[c], u[c]);
+    }
+
+    // Adds what a point's force does to two dofs.
+    static CUDA_CALLABLE inline void push(const REAL* J, const REAL* f, int apart, REAL* sum)
+    {
+        UNROLL
+        for (int r = 0; r < 3; ++r) {
+            const Two one = *(const Two*)(J + 2 * r);
+            sum[0] = FMA(one.x, f[r * apart], sum[0]);
+            sum[1] = FMA(one.y, f[r * apart], sum[1]);
+        }
+    }
+
+    // Two unit vectors across a normal.
+    static CUDA_CALLABLE inline void tangents(const REAL* n, REAL* one, REAL* other)
+    {
+        const bool flat = size_of(n[2]) < (REAL)0.7;
+        const REAL a = flat ? n[1] : n[2], b = flat ? -n[0] : -n[1];
+        const REAL r = 1 / sqrt(FMA(a, a, b * b));
+        one[0] = flat ? a * r : 0;
+        one[1] = flat ? b * r : a * r;
+        one[2] = flat ? 0 : b * r;
+        cross(n, one, other);
+    }
+};
+"""
+
+POINTS = r"""
+const int lane = (int)(thread % LANES);
+const long long number_of_world = thread / LANES;
+const bool alive = number_of_world < worlds;
+const long long world = alive ? number_of_world : worlds - 1;
+#if defined(__CUDA_ARCH__)
+extern __shared__ char dynamic_smem_base[];
+char* const bytes = dynamic_smem_base + (threadIdx.x / LANES) * BYTES;
+#else
+alignas(64) char bytes[BYTES];
+#endif
+REAL* const s = (REAL*)bytes;
+Tile* const A = (Tile*)(s + AT_A);
+REAL *const J = s + AT_J, *const slot = s + AT_SLOT, *const dof = s + AT_DOF, *const held_mass = s + AT_M;
+unsigned long long* const mask = (unsigned long long*)(bytes + AT_MASK);
+int *const run_start = (int*)(bytes + AT_RUN), *const run_couple = run_start + NEAR + 1;
+int *const slot_of = (int*)(bytes + AT_SLOT_OF), *const keep = (int*)(bytes + AT_KEEP);
+int* const count = (int*)(bytes + AT_COUNT);
+unsigned char* const rows = (unsigned char*)(bytes + AT_ROWS);
+enum { V0, X, DRIVE, DRY, LOAD, LIMIT, D, R, I0, L10, I1, CHANGE };
+enum { U0, CN = 3, CT, F, DEPTH = 8, ACROSS, FLAG };
+const int* const table = place.data;
+const int* const nears = near.data + world * (1 + 2 * NEAR);
+const REAL* const touch = touches.data + world * (NEAR * MOST * POINT);
+const int number_near = nears[0] < NEAR ? nears[0] : NEAR;
+const int pass_count = (int)passes;
+
+// -- slots: all points of the near pairs, or the deepest ones where there are more than slots
+EACH (k, number_near) {
+    int kept = 0;
+    for (int i = 0; i < nears[1 + NEAR + k]; ++i)
+        if (touch[(k * MOST + i) * POINT + 6] > -margin) kept |= 1 << i;
+    keep[k] = kept;
+}
+SYNC
+int total = 0;
+for (int k = 0; k < number_near; ++k)
+    for (int left = keep[k]; left; left &= left - 1) ++total;
+SYNC
+if (total > S) EACH (k, number_near) {
+    const int points = nears[1 + NEAR + k];
+    int kept = keep[k];
+    for (int i = 0; i < points; ++i) {
+        const REAL depth = touch[(k * MOST + i) * POINT + 6];
+        int deeper = 0;
+        for (int l = 0; l < number_near; ++l)
+            for (int j = 0; j < nears[1 + NEAR + l]; ++j) {
+                const REAL other = touch[(l * MOST + j) * POINT + 6];
+                deeper += other > depth || (other == depth && l * MOST + j < k * MOST + i);
+            }
+        if (deeper >= S) kept &= ~(1 << i);
+    }
+    keep[k] = kept;
+}
+SYNC
+if (lane == 0) {
+    int slots = 0, runs = 0, before = -1;
+    for (int k = 0; k < number_near; ++k) {
+        const int couple = table[T_PAIR + 2 * nears[1 + k]];
+        if (keep[k] && couple != before) {
+            run_start[runs] = slots;
+            run_couple[runs++] = before = couple;
+        }
+        for (int i = 0; i < MOST; ++i)
+            if (keep[k] >> i & 1) slot_of[slots++] = k * MOST + i;
+    }
+    run_start[runs] = slots;
+    run_couple[NEAR] = runs;
+}
+// -- what dofs do: an axis, and a point on it, inertial; then velocities and loads
+EACH (i, DOFS) {
+    REAL* const to = s + AT_A + 6 * i;
+    const REAL* const value = dof_values.data + DV * i;
+    const int axis_body = table[T_AXIS_BODY + i], body = table[T_POINT_BODY + i];
+    const REAL* const pose = poses.data + (world * poses.shape[1] + body) * 7;
+    if (axis_body >= 0) {
+        joint_space::turn(poses.data + (world * poses.shape[1] + axis_body) * 7, value + C_AXIS_X, to);
+    } else {
+        for (int c = 0; c < 3; ++c) to[c] = value[C_AXIS_X + c];
+    }
+    joint_space::turn(pose, value + C_X, to + 3);
+    for (int c = 0; c < 3; ++c) to[3 + c] += pose[c];
+}
+EACH (i, N) {
+    const int own = table[T_DOF_OF + i];
+    dof[V0 * N + i] = own < 0 ? 0 : qd.data[world * DOFS + own];
+    dof[LOAD * N + i] = own < 0 ? 0 : tau.data[world * DOFS + own] - bias.data[world * DOFS + own];
+    dof[X * N + i] = 0;
+}
+EACH (e, NNZ) held_mass[e] = mass.data[world * NNZ + e];
+SYNC
+const int runs = run_couple[NEAR], slots = run_start[runs];
+// -- Jacobians, in the axes of each point: normal, across, across
+LOOP
+for (int item = lane; item < slots * MB; item += LANES) {
+    const int at = item / MB, c = item - at * MB, where = slot_of[at];
+    const int couple = table[T_PAIR + 2 * nears[1 + where / MOST]], *const row = table + T_COUPLE + (1 + MB) * couple;
+    if (c >= row[0]) continue;
+    const int block = row[1 + c] & 255;
+    REAL axes[9], point[3];
+    for (int r = 0; r < 3; ++r) {
+        point[r] = touch[where * POINT + r];
+        axes[r] = touch[where * POINT + 3 + r];
+    }
+    joint_space::tangents(axes, axes + 3, axes + 6);
+    UNROLL
+    for (int d = 0; d < 2; ++d) {
+        const int sign = (row[1 + c] >> (8 + 2 * d) & 3) - 1, own = table[T_DOF_OF + 2 * block + d];
+        REAL column[3] = {0, 0, 0};
+        if (sign) {
+            const REAL *const axis = s + AT_A + 6 * own, *const value = dof_values.data + DV * own;
+            REAL arm[3];
+            for (int r = 0; r < 3; ++r) arm[r] = point[r] - axis[3 + r];
+            joint_space::cross(axis, arm, column);
+            for (int r = 0; r < 3; ++r)
+                column[r] = sign * FMA(value[C_ANGULAR], column[r], value[C_LINEAR] * axis[r]);
+        }
+        UNROLL
+        for (int r = 0; r < 3; ++r) J[(at * MB + c) * 6 + 2 * r + d] = joint_space::dot(axes + 3 * r, column);
+    }
+}
+// -- rows of each column of tiles: of the tree, of the couples that are near, and what elimination fills
+EACH (j, NB)
+    mask[j] = (unsigned int)table[T_MASK + 2 * j] | (unsigned long long)(unsigned int)table[T_MASK + 2 * j + 1] << 32;
+SYNC
+if (lane == 0) {
+    for (int k = 0; k < runs; ++k) {
+        const int* const row = table + T_COUPLE + (1 + MB) * run_couple[k];
+        unsigned long long all = 0;
+        for (int c = 0; c < row[0]; ++c) all |= 1ull << (row[1 + c] & 255);
+        for (int c = 0; c < row[0]; ++c) mask[row[1 + c] & 255] |= all & ~((2ull << (row[1 + c] & 255)) - 1);
+    }
+    for (int j = 0; j < NB; ++j)
+        if (mask[j]) {
+            const int over = joint_space::first_of(mask[j]);
+            mask[over] |= mask[j] & ~(1ull << over);
+        }
+}
+SYNC
+EACH (j, NB) {
+    int found = 0;
+    for (unsigned long long left = mask[j]; left; left &= left - 1)
+        rows[j * (NB + 1) + found++] = (unsigned char)joint_space::first_of(left);
+    rows[j * (NB + 1) + found++] = NB;
+    count[j] = found;
+}
+// -- velocities of the points before the step
+EACH (at, slots) {
+    const int where = slot_of[at], *const row = table + T_COUPLE
+        + (1 + MB) * table[T_PAIR + 2 * nears[1 + where / MOST]];
+    REAL u[3] = {0, 0, 0};
+    for (int c = 0; c < row[0]; ++c)
+        for (int r = 0; r < 3; ++r)
+            for (int d = 0; d < 2; ++d)
+                u[r] = FMA(J[(at * MB + c) * 6 + 2 * r + d], dof[V0 * N + 2 * (row[1 + c] & 255) + d], u[r]);
+    for (int r = 0; r < 3; ++r) slot[(U0 + r) * S + at] = u[r];
+    slot[DEPTH * S + at] = touch[where * POINT + 6];
+    slot[FLAG * S + at] = slot[ACROSS * S + at] = 0;
+}
+REAL cone = 0, pull = 0, effort_excess = 0;
+"""

@@ -1,0 +1,137 @@
+"""A time step of bodies that touch, solved in joint space: each pass factors A = Mass + h S + h sum J* G J.
+
+:mod:`warp_spo.reference.body_contact` is the specification. ``LANES`` threads of a warp take a world, whose matrices
+lie in shared memory; on the CPU one thread does the same work. Contact points fill slots. Neither a pair nor a point
+has code of its own: numbers of dofs, pairs and slots are constants, and what the scene has is read from tables. Every
+value is computed by one lane, in an order that does not depend on ``LANES``; so results have equal bits for any number
+of worlds and lanes.
+
+Dofs are grouped by two, so that A consists of 2 x 2 tiles; the right side is one more row of tiles. Rows of a column of
+tiles are listed once a step, from the tree and from the pairs that are near, and what is zero costs nothing. The
+unknown is the change of the velocity, whose rounding errors are those of the change.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import warp as wp
+
+from . import joint_passes, joint_points, native
+from .elementary import C_TYPE, FUSED
+
+SLOTS = 9  # as warp_spo.Status, which kernels cannot import; a test compares
+AWAY = 1e3  # gap of pairs that are not near [m]
+BLOCK = 32  # threads of a block: a warp
+MOST, POINT = 8, 7  # points of a near pair; entries of a point: place, normal towards the first body, depth
+DOF_FIELDS, SLOT_FIELDS = 12, 11
+DOF_VALUES = (
+    "stiffness", "rest", "damping", "ke", "kd", "effort", "dry", "fastest", "brake", "weight",
+    "lower", "upper", "limit_ke", "limit_kd", "linear", "angular", "axis_x", "axis_y", "axis_z", "x", "y", "z",
+)  # fmt: skip
+"""Constants of a dof; ``axis`` and ``x`` are in the axes of the bodies that the tables name."""
+PAIR_VALUES = ("stiffness", "damping", "friction", "eps", "weight")
+NUMBERS = ("h", "passes", "half_gravity", "margin")
+ARGUMENTS = [
+    ("mass", 2), ("bias", 2), ("tau", 2), ("q", 2), ("qd", 2), ("target_q", 2), ("target_qd", 2), ("poses", 3),
+    ("near", 1), ("touches", 2), ("dof_values", 1), ("pair_values", 1), ("place", 1),
+    *((name, 0) for name in NUMBERS),
+    ("out", 2), ("contact_f", 3), ("contact_gap", 2), ("contact_slip", 2), ("excess", 2), ("status", 1),
+]  # fmt: skip
+"""Names and numbers of axes.
+
+``bias``, ``tau`` [world, dof]: the bias force, and the hinges' forces.
+``near`` [world * (1 + 2 near pairs)]: how many pairs are near, which ones, and how many points each has.
+"""
+
+
+class Sizes(NamedTuple):
+    """Sizes of a scene's system.
+
+    Attributes:
+        dofs, tiles: of the scene; block columns of two dofs each.
+        entries: of the packed mass matrix. pairs, couples: pairs of shapes, pairs of bodies.
+        columns: block columns of a couple at most. near: pairs at most that are near in a world. slots: points at most.
+    """
+
+    dofs: int
+    tiles: int
+    entries: int
+    pairs: int
+    couples: int
+    columns: int
+    near: int
+    slots: int
+
+    @property
+    def table_starts(self) -> dict[str, int]:
+        """Where each table of integers begins in ``place``, in this order, and how long all are."""
+        sizes = {
+            "DOF_OF": 2 * self.tiles, "ENTRY": self.entries, "MASK": 2 * self.tiles,
+            "COUPLE": (1 + self.columns) * self.couples, "PAIR": 2 * self.pairs, "AXIS_BODY": self.dofs,
+            "POINT_BODY": self.dofs, "COORDINATE": self.dofs, "ROW_START": 2 * self.tiles + 1,
+            "ROW": 2 * self.entries - self.dofs,
+        }  # fmt: skip
+        starts, at = {}, 0
+        for name, size in sizes.items():
+            starts[name], at = at, at + size
+        return starts | {"END": at}
+
+
+def shared_layout(sizes: Sizes, T: type) -> tuple[dict[str, int], int]:
+    """Return where arrays of a world begin in shared memory, in scalars and then in bytes, and its bytes."""
+    b, real = sizes.tiles, 4 if T is wp.float32 else 8
+    starts, at = {}, 0
+    reals = {
+        "AT_A": max(4 * (b * (b + 1) // 2 + b), 6 * sizes.dofs, 96), "AT_J": 6 * sizes.columns * sizes.slots,
+        "AT_SLOT": SLOT_FIELDS * sizes.slots, "AT_DOF": DOF_FIELDS * 2 * b, "AT_M": sizes.entries,
+    }  # fmt: skip
+    for name, size in reals.items():
+        starts[name], at = at, at + -(-size // 4) * 4
+    at *= real
+    parts = {
+        "AT_MASK": 8 * b, "AT_RUN": 4 * (2 * sizes.near + 3), "AT_SLOT_OF": 4 * sizes.slots, "AT_KEEP": 4 * sizes.near,
+        "AT_COUNT": 4 * b, "AT_ROWS": b * (b + 1),
+    }  # fmt: skip
+    for name, size in parts.items():
+        starts[name], at = at, at + -(-size // 8) * 8
+    return starts, at + (16 - at) % 128  # worlds of a warp begin in different banks
+
+
+def world_bytes(sizes: Sizes, T: type) -> int:
+    """Return the shared memory of a world."""
+    return shared_layout(sizes, T)[1]
+
+
+@functools.cache
+def solver(sizes: Sizes, T: type, lanes: int = 32, registers: int | None = None, refine: int = 1) -> wp.Kernel:
+    """Return the kernel of a step; ``lanes`` of 8, 16 or 32 threads of a warp take a world on CUDA.
+
+    ``refine``: steps of iterative refinement in the last pass.
+
+    It launches ``lanes * worlds`` threads on CUDA, ``worlds`` on the CPU, in blocks of BLOCK.
+    """
+    starts, size = shared_layout(sizes, T)
+    constants = {
+        "DOFS": sizes.dofs, "N": 2 * sizes.tiles, "NB": sizes.tiles, "NNZ": sizes.entries, "PAIRS": sizes.pairs,
+        "MB": sizes.columns, "NEAR": sizes.near, "S": sizes.slots, "BYTES": size, "MOST": MOST, "POINT": POINT,
+        "DV": len(DOF_VALUES), "PV": len(PAIR_VALUES), "TILES": sizes.tiles * (sizes.tiles + 1) // 2 + sizes.tiles,
+        "CROWDED": SLOTS, "REFINE": refine,
+    }  # fmt: skip
+    constants |= starts | {f"T_{name}": at for name, at in sizes.table_starts.items()}
+    constants |= {f"C_{name.upper()}": i for i, name in enumerate(DOF_VALUES)}
+    constants |= {f"P_{name.upper()}": i for i, name in enumerate(PAIR_VALUES)}
+    c = C_TYPE[T]
+    text = (joint_points.FUNCTIONS + joint_points.POINTS + joint_passes.NATIVE).replace(
+        "CONSTANTS", ", ".join(f"{name} = {x}" for name, x in constants.items())
+    )
+    text = text.replace("UNROLL\n", "#pragma unroll\n").replace("LOOP\n", "#pragma unroll 1\n")
+    text = (
+        text.replace("AWAY", f"(REAL){AWAY}")
+        .replace("LANE_COUNT", str(lanes))
+        .replace("REAL", c)
+        .replace("FMA(", f"FUSED_{c}(")
+    )
+    text = text.replace("INVERSE_ROOT(", "rsqrtf(" if T is wp.float32 else "rsqrt(")
+    return native.kernel("joint_space", FUSED + text, ARGUMENTS, T, registers=registers, shared=size * (BLOCK // lanes))

@@ -1,0 +1,246 @@
+"""What a solver in joint space reads of a scene: the order of its dofs, their axes and laws, and its pairs."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import UnsupportedError
+from ..kernels import joint_space, near_pairs
+from ..recursions.contact.couples import Polyhedron
+from ..recursions.contact.pairs import inverse_weights
+from ..recursions.step.joint_laws import DEFAULT_BOUND, HOLD, neutral_inertias
+from ..scene.parts import UNLIMITED
+from ..scene.scene import Scene
+
+MOST_DOFS = 100  # with those that fill limbs they are 128 at most, the bits of a mask of tiles
+NONE = 1e30  # a bound that no force or rate reaches
+SIGNS = {-1: 0, 0: 1, 1: 2}  # two bits of a column
+
+
+class JointTables(NamedTuple):
+    """Tables of a scene.
+
+    Attributes:
+        sizes: of the system. place: integers, see :class:`~warp_spo.kernels.joint_space.Sizes`.
+        dof_values, pair_values: constants, flat. which, sides: of the shapes of pairs, flat.
+        hulls, long, faces: what the narrow phase needs to know of the shapes.
+    """
+
+    sizes: joint_space.Sizes
+    place: np.ndarray
+    dof_values: np.ndarray
+    pair_values: np.ndarray
+    which: np.ndarray
+    sides: np.ndarray
+    hulls: tuple[Polyhedron, ...]
+    long: bool
+    faces: bool
+
+
+def joint_tables(scene: Scene, pattern: tuple[np.ndarray, np.ndarray], near: int, slots: int) -> JointTables:
+    """Return the tables of a scene whose packed mass matrix has rows and columns ``pattern``.
+
+    ``near``: pairs at most that are near in a world. ``slots``: points at most.
+    """
+    _refuse(scene)
+    dofs_of = [np.arange(scene.qd_start[h], scene.qd_start[h + 1]) for h in scene.hinge_of]
+    ways = _ways(scene)
+    order = _order(scene, dofs_of, ways)
+    position = {dof: i for i, dof in enumerate(order) if dof >= 0}
+    tiles = len(order) // 2
+    if tiles > 64:
+        what = f"limbs with {len(order)} dofs, each limb's even, more than 128,"
+        raise UnsupportedError("Dynamics.step", f"{what} where bodies touch in joint space", "use another solver")
+    couples, columns = _couples(scene, dofs_of, ways, position)
+    pairs = sorted(range(len(scene.contact_pairs)), key=lambda i: (couples[_bodies(scene, i)], i))
+    rows, cols = pattern
+    sizes = joint_space.Sizes(
+        scene.dof_count, tiles, len(rows), len(pairs), len(couples), max(map(len, columns), default=0), near, slots
+    )
+    entries, masks = _entries(rows, cols, position, tiles)
+    axis_body, point_body, coordinate, dof_values = _dofs(scene)
+    table: list[int] = [*order, *entries]
+    table += [(mask >> shift) & 0xFFFFFFFF for mask in masks for shift in (0, 32)]
+    for each in columns:
+        table += [len(each), *each, *[0] * (sizes.columns - len(each))]
+    for pair in pairs:
+        table += [couples[_bodies(scene, pair)], pair]
+    table += [*axis_body, *point_body, *coordinate]
+    met: list[list[int]] = [[] for _ in order]  # entry and the other dof, of each dof
+    for entry, both in enumerate(zip(rows.tolist(), cols.tolist(), strict=True)):
+        for i, j in {tuple(both), tuple(both[::-1])}:
+            met[position[i]].append(entry << 8 | position[j])
+    table += [*np.cumsum([0, *map(len, met)]).tolist(), *(x for row in met for x in sorted(row))]
+    assert len(table) == sizes.table_starts["END"]
+    which, sides, solids = _shapes(scene, pairs)
+    return JointTables(
+        sizes, np.array(table, dtype=np.int64).astype(np.uint32).view(np.int32), np.ravel(dof_values),
+        np.ravel(_pair_values(scene, pairs)), which, sides, *solids,
+    )  # fmt: skip
+
+
+def _refuse(scene: Scene) -> None:
+    kinds = {hinge.kind for hinge in scene.hinges if hinge.dof_count > 1} - {"free", "ball"}
+    kinds |= {hinge.kind for hinge in scene.hinges if hinge.kind == "custom"}
+    lacks = [f"{kind} hinges" for kind in sorted(kinds)]
+    lacks += ["hinges that share dofs"] * bool(scene.shares_dofs)
+    lacks += ["bodies with modes"] * any(body.modes is not None for body in scene.bodies)
+    lacks += [f"{scene.dof_count} dofs, more than {MOST_DOFS},"] * (scene.dof_count > MOST_DOFS)
+    if lacks:
+        raise UnsupportedError("Dynamics.step", f"{lacks[0]} where bodies touch in joint space", "use another solver")
+
+
+def _ways(scene: Scene) -> list[list[int]]:
+    """Return the bodies from each body to the root of its tree, itself first."""
+    found = []
+    for body in range(len(scene.bodies)):
+        way = [body]
+        while scene.tree.parent[way[-1]] >= 0:
+            way.append(int(scene.tree.parent[way[-1]]))
+        found.append(way)
+    return found
+
+
+def _bodies(scene: Scene, pair: int) -> tuple[int, int]:
+    return scene.contact_pairs[pair].body, scene.contact_pairs[pair].other
+
+
+def _order(scene: Scene, dofs_of: list[np.ndarray], ways: list[list[int]]) -> list[int]:
+    """Return dofs in the order of elimination, each limb from an even place on; -1 fills.
+
+    Trees that touch many others come last, and children before what carries them, so that limbs fill nothing.
+    """
+    trees: dict[int, list[int]] = {}
+    for body, way in enumerate(ways):
+        trees.setdefault(way[-1], []).append(body)
+    met: dict[int, set[int]] = {root: set() for root in trees}
+    for pair in scene.contact_pairs:
+        roots = [ways[body][-1] for body in (pair.body, pair.other) if body >= 0]
+        for root in roots:
+            met[root] |= set(roots) - {root}
+    order: list[int] = []
+    sizes = {root: sum(len(dofs_of[body]) for body in bodies) for root, bodies in trees.items()}
+    for root in sorted(trees, key=lambda root: (len(met[root]), -sizes[root], root)):
+        children: dict[int, list[int]] = {body: [] for body in trees[root]}
+        for body in trees[root]:
+            if body != root:
+                children[ways[body][1]].append(body)
+        _add_limbs(root, children, dofs_of, order)
+    return order
+
+
+def _add_limbs(root: int, children: dict[int, list[int]], dofs_of: list[np.ndarray], order: list[int]) -> None:
+    """Add a tree's dofs, leaves first; a limb is a chain of bodies without branches."""
+    chain = [root]
+    while len(children[chain[-1]]) == 1:
+        chain += children[chain[-1]]
+    for child in children[chain[-1]]:
+        _add_limbs(child, children, dofs_of, order)
+    for body in reversed(chain):
+        order += dofs_of[body].tolist()
+    order += [-1] * (len(order) % 2)
+
+
+def _couples(
+    scene: Scene, dofs_of: list[np.ndarray], ways: list[list[int]], position: dict[int, int]
+) -> tuple[dict[tuple[int, int], int], list[list[int]]]:
+    """Return the number of each couple of bodies, and its columns: block, and which way each dof moves the first."""
+    couples: dict[tuple[int, int], int] = {}
+    columns = []
+    for pair in range(len(scene.contact_pairs)):
+        bodies = _bodies(scene, pair)
+        if bodies in couples:
+            continue
+        couples[bodies] = len(couples)
+        first, second = (set(ways[body]) if body >= 0 else set() for body in bodies)
+        signs = {position[dof]: sign for sign, own in ((1, first - second), (-1, second - first))
+                 for body in own for dof in dofs_of[body].tolist()}  # fmt: skip
+        blocks = sorted({at // 2 for at in signs})
+        columns.append([b | SIGNS[signs.get(2 * b, 0)] << 8 | SIGNS[signs.get(2 * b + 1, 0)] << 10 for b in blocks])
+    return couples, columns
+
+
+def _entries(rows: np.ndarray, cols: np.ndarray, position: dict[int, int], tiles: int) -> tuple[list[int], list[int]]:
+    """Return where each entry of the mass matrix goes, diagonal ones as ~place, and which tiles a column has."""
+    entries, masks = [], [0] * tiles
+    for row, col in zip(rows.tolist(), cols.tolist(), strict=True):
+        i, j = sorted((position[row], position[col]), reverse=True)
+        if i // 2 != j // 2:
+            masks[j // 2] |= 1 << (i // 2)
+        tile = (i // 2) * (i // 2 + 1) // 2 + j // 2
+        entries.append(~i if i == j else 4 * tile + 2 * (i % 2) + j % 2)
+    return entries, masks
+
+
+def _dofs(scene: Scene) -> tuple[list[int], list[int], list[int], np.ndarray]:
+    """Return of each dof the body with its axis, the body with a point on it, its coordinate, and its constants."""
+    count, value = scene.dof_count, lambda name: np.asarray(scene.values[name][0], dtype=np.float64)
+    of = {name: np.zeros(count) for name in joint_space.DOF_VALUES}
+    names = {"stiffness": "joint_stiffness", "damping": "joint_damping", "ke": "joint_target_ke",
+             "kd": "joint_target_kd", "dry": "joint_friction", "limit_ke": "joint_limit_ke",
+             "limit_kd": "joint_limit_kd"}  # fmt: skip
+    for name, source in names.items():
+        of[name][:] = value(source)
+    effort, fastest = value("joint_effort_limit"), value("joint_velocity_limit")
+    of["effort"] = np.where(effort < DEFAULT_BOUND, effort, NONE)
+    of["fastest"] = np.where(np.abs(fastest) < DEFAULT_BOUND, fastest, NONE)
+    inertia = np.array([neutral_inertias(scene)[dof] for dof in range(count)])
+    of["weight"] = 1.0 / inertia
+    of["brake"] = HOLD * inertia  # over h
+    for name in ("lower", "upper"):
+        bound = value(f"joint_limit_{name}")
+        of[name] = np.where(np.abs(bound) < UNLIMITED, bound, NONE)
+    bodies = [[-1] * count, [0] * count, [-1] * count]
+    for body, h in enumerate(scene.hinge_of):
+        hinge = scene.hinges[h]
+        anchor, own = value("joint_X_p")[h], value("joint_X_c")[h]
+        for i, dof in enumerate(range(scene.qd_start[h], scene.qd_start[h + 1])):
+            point, linear, angular, axis = own[:3], 0.0, 1.0, np.eye(3)[i % 3]
+            if hinge.kind == "free":
+                linear, angular = (1.0, 0.0) if i < 3 else (0.0, 1.0)
+                point = value("body_com")[body]
+            elif hinge.kind != "ball":
+                axis, angular, linear = hinge.screws[i]
+                bodies[2][dof] = int(scene.q_start[h]) + i
+                of["rest"][dof] = value("joint_rest_q")[scene.q_start[h] + i]
+            bodies[0][dof], bodies[1][dof] = int(scene.tree.parent[body]), body
+            of["linear"][dof], of["angular"][dof] = linear, angular
+            for name, x in zip(("axis_x", "axis_y", "axis_z"), _turned(anchor[3:], axis), strict=True):
+                of[name][dof] = x
+            for name, x in zip("xyz", point, strict=True):
+                of[name][dof] = x
+    return *bodies, np.stack([of[name] for name in joint_space.DOF_VALUES], axis=1)  # type: ignore[return-value]
+
+
+def _turned(q: np.ndarray, x: np.ndarray) -> np.ndarray:
+    t = 2.0 * np.cross(q[:3], x)
+    return np.asarray(x) + q[3] * t + np.cross(q[:3], t)
+
+
+def _pair_values(scene: Scene, pairs: list[int]) -> np.ndarray:
+    first = len(scene.contact_points)
+    values = [scene.values[f"contact_{name}"][0] for name in ("stiffness", "damping", "friction")]
+    weights = inverse_weights(scene)
+    return np.array([[*(x[first + i] for x in values), scene.contact_pairs[i].eps, weights[i]] for i in pairs])
+
+
+def _shapes(scene: Scene, pairs: list[int]) -> tuple[np.ndarray, np.ndarray, tuple]:
+    """Return integers and constants of the shapes of the pairs, and what the narrow phase needs to know of them."""
+    which, sides, hulls, long, faces = [], [], {}, False, False  # type: ignore[var-annotated]
+    for number in pairs:
+        pair = scene.contact_pairs[number]
+        for body, shape in zip((pair.body, pair.other), pair.shapes, strict=True):
+            hull = -1
+            if shape.hull is not None:
+                hull = hulls.setdefault(Polyhedron(shape.hull.planes, shape.hull.edges), len(hulls))
+            which.append([body, int(shape.has_faces), hull])
+            ball = float(np.linalg.norm(shape.size)) + shape.radius
+            sides.append([*shape.pose, *shape.size, shape.radius, ball])
+        a, b = pair.shapes
+        faces |= a.hull is not None and b.hull is not None
+        sticks = [one for one in (a, b) if not one.has_faces]
+        long |= len(sticks) == 1 and sticks[0].size[2] > 0.0
+    assert not sides or len(sides[0]) == len(near_pairs.SIDE)
+    return np.ravel(which).astype(np.int32), np.ravel(sides), (tuple(hulls), long, faces)
