@@ -59,7 +59,9 @@ class Env(VecEnv):
         actions: one of :mod:`warp_spo.env.actions`, or several; the policy's numbers are theirs, one after the other.
         observations: for each group a list of terms, functions of a ``World`` or ``Observation``.
         rewards: (weight, term) by name. The reward is the sum of weight times term times the length of the step.
+            A weight is a number or a ``Curriculum`` of :mod:`warp_spo.env.curricula`.
         terminations: terms by name.
+        metrics: terms by name whose means over episodes are logged; nothing else depends on them.
         commands: None, or one of :mod:`warp_spo.env.commands`.
         events: of :mod:`warp_spo.env.events`.
         episode_length_s: after this time an episode ends with a time-out [s].
@@ -99,8 +101,9 @@ class Env(VecEnv):
         decimation: int = 4,
         actions: Any,
         observations: Mapping[str, Sequence[Any]],
-        rewards: Mapping[str, tuple[float, Callable]],
+        rewards: Mapping[str, tuple[Any, Callable]],
         terminations: Mapping[str, Callable] | None = None,
+        metrics: Mapping[str, Callable] | None = None,
         commands: Any = None,
         events: Sequence[Any] = (),
         episode_length_s: float = 20.0,
@@ -126,7 +129,7 @@ class Env(VecEnv):
         self._passes, self.has_commands = arguments.checked_passes(scene, passes), commands is not None
         self.final = arguments.checked_bool("final_observations", final_observations)
         default, commands = arguments.checked_default(scene, default_q), arguments.checked_commands(commands)
-        terms = arguments.checked_terms(observations, rewards, terminations or {}, events)
+        terms = arguments.checked_terms(observations, rewards, terminations or {}, metrics or {}, events)
         self.bounds = arguments.checked_bounds(bounds)
         guard = Guard(self.bounds.limits(scene, self.dt, episode_length_s, list(terms[1]), terms[0]))
         self._layout = MemoryLayout(scene, default, self.step_dt, commands, changed_values(scene, events), guard)
@@ -150,18 +153,20 @@ class Env(VecEnv):
             self._compile()
         self.reset(seed=seed)
 
-    def _trace(self, actions: Any, groups: Any, rewards: Any, terminations: Any, commands: Any, events: Any) -> Tracing:
+    def _trace(
+        self, actions: Any, groups: Any, rewards: Any, terminations: Any, metrics: Any, commands: Any, events: Any
+    ) -> Tracing:
         """Return the traced stages of the checked terms; keep the names and counts of their numbers."""
         layout = self._layout
         self.action_labels = [label for part in actions for label in part.labels(self.scene)]
         self.action_clips = [part.clip for part in actions for _ in part.labels(self.scene)]
         self.num_actions = layout.action_count = len(self.action_labels)
         layout.action_arrays = {part.array for part in actions}
-        tracing = Tracing(layout, actions, groups, rewards, terminations, commands, list(events))
+        tracing = Tracing(layout, actions, groups, rewards, terminations, metrics, commands, list(events))
         tracing.run(self.max_episode_length, self.final)
         self.reward_names, self.termination_names = list(rewards), tracing.ends
         self.observation_terms = tracing.observation_terms
-        self.num_obs, self._levels = tracing.group_sizes, checkpoint.level_names(events, commands)
+        self.num_obs, self._levels = tracing.group_sizes, checkpoint.level_names(events, commands, layout.levels)
         self._values_later = any(isinstance(event, Values) and event.when != "start" for event in events)
         return tracing
 

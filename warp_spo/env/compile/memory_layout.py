@@ -27,7 +27,9 @@ class MemoryLayout:
         drawn: functions that return memory that is drawn once, by name. observations: a number for each of those that
             remember something.
         tables: numbers that all worlds share, by their names in kernels. table_names: names that terms give them.
-        weights: of rewards.
+        weights: of rewards. metrics: terms by name.
+        levels: of curricula, by the names of what they follow. judged: the world of the stage "judge", and whether its
+            episode ended with numbers that count; None before it is known.
         values: names of the scene's values that events change. unequal: of those that stages read, and that differ
             between worlds of the scene itself.
         guard: what ends worlds whose numbers are out of bounds.
@@ -63,7 +65,10 @@ class MemoryLayout:
         self.observations: dict[Any, int] = {}
         self.tables: dict[str, np.ndarray] = {}
         self.table_names: list[str] = []
-        self.weights: dict[str, float] = {}
+        self.weights: dict[str, Any] = {}
+        self.metrics: dict[str, Any] = {}
+        self.levels: dict[str, Any] = {}
+        self.judged: tuple[Any, Any] | None = None
         self.users: dict[Any, tuple[str, int]] = {}
         self.user_size = 0
         self.sensors: dict[str, tuple[int, float | None, Any]] = {}
@@ -99,6 +104,13 @@ class MemoryLayout:
         """Return a time in steps of the environment, a whole number where it is one but for rounding."""
         steps = seconds / self.step_dt
         return round(steps) if abs(steps - round(steps)) <= ROUNDING * max(1.0, steps) else steps
+
+    def grown(self, name: str) -> Any:
+        """Return what a world remembers of a level after the step that "judge" looks at, which keeps it."""
+        w, ended = self.judged  # type: ignore[misc]
+        if name not in w.kept:
+            w.keep(name, [self.levels[name].update(w, w.memory(name, 1, reset=None)[0], ended)])
+        return w.kept[name][0]
 
     def output(self, result: str) -> str:
         """Return the name under which kernels write a result: its number, so that no user's name reaches a compiler."""
