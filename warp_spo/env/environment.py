@@ -20,8 +20,10 @@ from ..runtime.launches import compile_side_by_side
 from ..runtime.torch_tensors import stream
 from ..scene.scene import Scene
 from . import arguments, checkpoint, seeding
+from .actions import ActuatorNet
 from .bounds import Bounds
 from .commands import COMMAND, HELD
+from .compile.actuator_launches import ActuatorLaunches
 from .compile.buffers import Storage
 from .compile.cuda_graphs import Part, Replay, run_all
 from .compile.fused_kernel import Launch
@@ -139,7 +141,12 @@ class Env(VecEnv):
         store = self._store = self._allocate(tracing)
         self.q, self.qd, self.actions, self.chosen = (store.tensors[n] for n in ("q", "qd", "actions", "chosen"))
         self._tensors, self._controls, self._report = store.tensors, store.controls, StepReport(**store.written)
-        self._step_options = StepOptions(substeps=self.decimation, passes=self._passes)
+        substeps = 1 if self._learned else self.decimation  # networks are evaluated before each
+        self._step_options = StepOptions(substeps=substeps, passes=self._passes)
+        device = self.warp_device
+        self._networks = (
+            ActuatorLaunches(self._learned, self._layout, store, decimation, device) if self._learned else None
+        )
         self.values, self._actuator_state = store.values, self._delay_buffers(events)
         self._log = Log(self._layout, self.reward_names, self.termination_names, self.device, worlds)
         points, seen = len(scene.contact_points), tracing.observed_entries
@@ -162,6 +169,9 @@ class Env(VecEnv):
         self.action_clips = [part.clip for part in actions for _ in part.labels(self.scene)]
         self.num_actions = layout.action_count = len(self.action_labels)
         layout.action_arrays = {part.array for part in actions}
+        self._learned = [part for part in actions if isinstance(part, ActuatorNet)]
+        layout.networks = [(len(part.hinges(self.scene)), max(part.network.input_idx)) for part in self._learned]
+        layout.action_arrays |= {"tau"} if self._learned else set()
         tracing = Tracing(layout, actions, groups, rewards, terminations, metrics, commands, list(events))
         tracing.run(self.max_episode_length, self.final)
         self.reward_names, self.termination_names = list(rewards), tracing.ends
@@ -387,6 +397,15 @@ class Env(VecEnv):
         """Compute the controls from the actions, and step the dynamics of all worlds in place."""
         self._launch("act")
         controls = self._controls
+        if self._networks is None:
+            self._step_dynamics(controls)
+        else:
+            self._networks.run(lambda: self._step_dynamics(controls), self._stream)
+        if "actuator_force" in self._tensors:
+            self.dyn.actuator_force(self.q, self.qd, controls["ctrl"], out=self._tensors["actuator_force"])
+
+    def _step_dynamics(self, controls: dict[str, torch.Tensor]) -> None:
+        """Take the steps of the dynamics that have the same controls."""
         self.dyn.step(
             self.q,
             self.qd,
@@ -399,8 +418,6 @@ class Env(VecEnv):
             report=self._report,
             out=(self.q, self.qd),
         )
-        if "actuator_force" in self._tensors:
-            self.dyn.actuator_force(self.q, self.qd, controls["ctrl"], out=self._tensors["actuator_force"])
 
     def _observe_final(self) -> None:
         self._after("final")

@@ -12,6 +12,8 @@ from .guard import Guard
 from .vectors import find
 
 ROUNDING = 1e-9  # share of a time in float64 that is its rounding
+AGE = "actuator net steps"  # name under which a world with learned actuators remembers its steps since the start
+NET_TARGETS = "net_targets"  # array of the positions that learned actuators are asked for [world, coordinate]
 LEFT_OUT: Any = object()
 """In place of a value at a reset: zero, unless somebody says it."""
 
@@ -21,7 +23,8 @@ class MemoryLayout:
 
     Attributes:
         memory: (start, size, value at a reset) of what worlds remember, by name. frames: that terms ask for.
-        action_arrays: that actions set: "ctrl", "target_q", "tau". biased: hinges whose encoders have a bias.
+        action_arrays: that actions set: "ctrl", "target_q", "tau", "net_targets". networks: joints of each learned
+            actuator, and how many substeps it looks back. biased: hinges whose encoders have a bias.
         sensors: (size, value at a reset, function that keeps it) of memory that each step brings up to date, by name.
         users: (stage, start) of the numbers of each user's term in torch.
         drawn: functions that return memory that is drawn once, by name. observations: a number for each of those that
@@ -55,6 +58,7 @@ class MemoryLayout:
         self.guard = guard
         self.action_count = 0
         self.action_arrays: set[str] = set()
+        self.networks: list[tuple[int, int]] = []
         self.biased: list[int] = []
         self.memory: dict[str, tuple[int, int, float | None]] = {}
         self.memory_size = 0
@@ -152,4 +156,5 @@ class MemoryLayout:
     def control_sizes(self) -> dict[str, int]:
         """How many entries each array has that actions may set."""
         scene = self.scene
-        return {"ctrl": len(scene.actuators), "tau": scene.dof_count, "target_q": scene.coord_count}
+        targets = dict.fromkeys(("target_q", NET_TARGETS), scene.coord_count)
+        return {"ctrl": len(scene.actuators), "tau": scene.dof_count, **targets}
