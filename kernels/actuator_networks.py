@@ -7,7 +7,6 @@ start writes into slot k mod slots. Weights are constants of the kernel's text.
 
 import functools
 
-import numpy as np
 import warp as wp
 
 from . import native
@@ -36,10 +35,8 @@ ARRAYS = ("q", "qd", "target", "limit", "memory", "ring", "mean_force", "force",
 
 def _table(name: str, values, kind: str = "float") -> str:
     """Return a constant array of C++."""
-    numbers = [f"{float(x):.9g}" for x in np.asarray(values).ravel()]
-    words = [x + ("" if "." in x or "e" in x else ".0") + "f" for x in numbers]
-    if kind == "int":
-        words = [str(int(x)) for x in np.asarray(values).ravel()]
+    numbers = [str(x) if kind == "int" else f"{x:.9g}" for x in values]
+    words = [x if kind == "int" else x + ("" if "." in x or "e" in x else ".0") + "f" for x in numbers]
     return f"static constexpr {kind} {name}[] = {{{', '.join(words)}}};"
 
 
@@ -108,7 +105,7 @@ def torques(
     for i, (weights, biases) in enumerate(layers):
         outs, ins = len(biases), len(weights[0])
         text += [
-            _table(f"w{i}", np.transpose(weights)),  # a row for each input
+            _table(f"w{i}", [row[k] for k in range(ins) for row in weights]),  # outputs of an input side by side
             _table(f"b{i}", biases),
             f"float x{i + 1}[{outs}];",
             "UNROLL",
