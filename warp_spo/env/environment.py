@@ -311,6 +311,7 @@ class Env(VecEnv):
     def controls(self, actions: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return what actions set, "ctrl", "target_q" or "tau" [world, ...]; worlds remember them as their actions."""
         self.actions.copy_(arguments.checked_actions("Env.controls", actions, self.num_envs, self.action_labels))
+        self._after("act")
         self._launch("act")
         return {name: controls.clone() for name, controls in self._controls.items()}
 
@@ -395,6 +396,7 @@ class Env(VecEnv):
 
     def _physics(self) -> None:
         """Compute the controls from the actions, and step the dynamics of all worlds in place."""
+        self._after("act")
         self._launch("act")
         controls = self._controls
         if self._networks is None:
@@ -450,6 +452,8 @@ class Env(VecEnv):
         if any(kernel.reads_frames for kernel in kernels):
             self.dyn.frame_poses(self.q, frames, out=self._tensors["frame_pose"])
             self.dyn.frame_velocities(self.q, self.qd, frames, out=self._tensors["frame_velocity"])
+        if any(kernel.reads_jacobians for kernel in kernels):
+            self.dyn.jacobian(self.q, self._layout.jacobians, out=self._tensors["frame_jacobian"])
         if any(kernel.reads_accelerations for kernel in kernels):
             qdd, out = self._report.qdd, self._tensors["frame_acceleration"]
             self.dyn.frame_accelerations(self.q, self.qd, qdd, frames, out=out)

@@ -333,6 +333,15 @@ class World:
         rates = vector(self._scalar("frame_velocity", 6 * at + i) for i in range(6))
         return Frame(pose[:3], pose[3:], rates[:3], rates[3:])
 
+    def jacobian(self, name: Any) -> np.ndarray:
+        """Return the velocity of a frame's origin, then its angular velocity, per unit qd [6, dof], inertial axes.
+
+        ``name`` as :meth:`frame`.
+        """
+        at, dofs = self._layout.jacobian(name), self.scene.dof_count
+        entries = (self._scalar("frame_jacobian", 6 * dofs * at + i) for i in range(6 * dofs))
+        return vector(entries).reshape(6, dofs)
+
     def imu(self, name: Any) -> Imu:
         """Return what an inertial measurement unit at a frame measures; ``name`` as :meth:`frame`.
 

@@ -139,6 +139,9 @@ class Storage:
         if frames:
             self._add("frame_pose", self._zeros(worlds, frames, 7))
             self._add("frame_velocity", self._zeros(worlds, frames, 6))
+        if layout.jacobians:
+            size = len(layout.jacobians)
+            self._add("frame_jacobian", self._zeros(worlds, size, 6, layout.scene.dof_count))
         if read & {"frame_acceleration", "qdd"}:
             self.written["qdd"] = self._add("qdd", self._zeros(worlds, layout.scene.dof_count))
         if "frame_acceleration" in read:

@@ -23,6 +23,7 @@ class MemoryLayout:
 
     Attributes:
         memory: (start, size, value at a reset) of what worlds remember, by name. frames: that terms ask for.
+        jacobians: frames whose Jacobians they ask for.
         action_arrays: that actions set: "ctrl", "target_q", "tau", "net_targets". networks: joints of each learned
             actuator, and how many substeps it looks back. biased: hinges whose encoders have a bias.
         sensors: (size, value at a reset, function that keeps it) of memory that each step brings up to date, by name.
@@ -65,6 +66,7 @@ class MemoryLayout:
         self.unsaid: set[str] = set()  # names whose value at a reset nobody has said
         self.unequal: set[str] = set()
         self.frames: list[Any] = []
+        self.jacobians: list[Any] = []
         self.drawn: dict[str, Any] = {}
         self.observations: dict[Any, int] = {}
         self.tables: dict[str, np.ndarray] = {}
@@ -151,6 +153,13 @@ class MemoryLayout:
         if name not in self.frames:
             self.frames.append(name)
         return self.frames.index(name)
+
+    def jacobian(self, name: Any) -> int:
+        """Return the number of a frame among those whose Jacobians terms ask for."""
+        frame = self.frames[self.frame(name)]
+        if frame not in self.jacobians:
+            self.jacobians.append(frame)
+        return self.jacobians.index(frame)
 
     @property
     def control_sizes(self) -> dict[str, int]:
