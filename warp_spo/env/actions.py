@@ -186,8 +186,8 @@ class ActuatorNet:
         gains = scene.values["joint_target_ke"][0] + scene.values["joint_target_kd"][0]
         if driven := [scene.joint_labels[i] for i in found if gains[scene.qd_start[i]] > 0.0]:
             raise ValueError(
-                f"actions.ActuatorNet: drives of {', '.join(map(shown, driven))} would act beside the network; expected "
-                "joints without: scene.with_values(joint_target_ke=..., joint_target_kd=...) with zeros there"
+                f"actions.ActuatorNet: drives of {', '.join(map(shown, driven))} would act beside the network; "
+                "expected joints without: scene.with_values(joint_target_ke=..., joint_target_kd=...) with zeros there"
             )
         return found
 

@@ -85,6 +85,7 @@ class Env(VecEnv):
         values: what events have made of the scene's values, torch tensors [world, ...] by name.
         dyn: the :class:`Dynamics`. has_commands: whether it gives commands.
         action_labels, action_clips: of each action, what it sets, and None or the (lowest, highest) that counts.
+        options: with which a task has changed its arguments, see ``settings.make_env``; {} without a task.
         observation_terms: of each group (name, size, ``Observation``) of its terms, in their order.
         num_envs, num_actions, num_obs, max_episode_length, episode_length_buf, device, cfg: as rsl_rl names them.
 
@@ -127,6 +128,7 @@ class Env(VecEnv):
         self.step_dt = self.dt * self.decimation
         self.first_world = check_whole("Env", "first_world", first_world, 0, 2**32 - 1)
         self.seed, self.cfg = check_whole("Env", "seed", seed, 0, 2**64 - 1), {} if cfg is None else cfg
+        self.options: dict[str, Any] = {}
         self.log_interval = check_whole("Env", "log_interval", log_interval, 1)
         self._passes, self.has_commands = arguments.checked_passes(scene, passes), commands is not None
         self.final = arguments.checked_bool("final_observations", final_observations)

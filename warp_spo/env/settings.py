@@ -153,7 +153,9 @@ def make_env(scene: Any, worlds: int, device: Any, options: Mapping[str, Any], *
     for name, value in options.items():
         name = _known(name, dict.fromkeys([*own, *known]), "")
         found[name] = changed(own[name], value, name) if name in own else value
-    return Env(scene, worlds, device, **found)
+    env = Env(scene, worlds, device, **found)
+    env.options = dict(options)
+    return env
 
 
 def arguments(chosen: Any, given: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from ..errors import shown
 from ..scene.scene import Scene
 from ..trace.functions import clip, where
 from .actions import Control, Position, spread
-from .compile.vectors import Vector, find, multiply, vector
+from .compile.vectors import Vector, multiply, vector
 from .validation import check_number, check_optional_span
 from .world import World
 
