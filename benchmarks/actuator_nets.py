@@ -69,7 +69,7 @@ def compare(device: Any, net: ActuatorNetwork, worlds: int = 64) -> float:
         step(controls)
 
     env._step_dynamics = record  # type: ignore[method-assign]
-    limit = torch.tensor(env.scene.values["joint_effort_limit"][0, 6:], dtype=torch.float32, device=env.device)
+    limit = torch.tensor(env.scene.values["joint_effort_limit"][0, 6:], device=env.device)
     generator, past, worst, largest = torch.Generator().manual_seed(0), [], 0.0, 0.0
     zero = torch.zeros(worlds, 12, device=env.device)
     for _ in range(STEPS):
@@ -80,7 +80,7 @@ def compare(device: Any, net: ActuatorNetwork, worlds: int = 64) -> float:
             past = [(target - q[:, 7:], qd[:, 6:]), *past[: max(net.input_idx)]]
             seen = [past[lag] if lag < len(past) else (zero, zero) for lag in net.input_idx]
             errors, rates = (torch.stack([each[i] for each in seen], dim=-1) for i in (0, 1))
-            torque = net.torque(errors, rates).clamp(-limit, limit)
+            torque = net.torque(errors.double(), rates.double()).clamp(-limit, limit)  # float32 may be TF32 on a GPU
             worst = max(worst, float((tau[:, 6:] - torque).abs().max()))
             largest = max(largest, float(torque.abs().max()))
         past = [tuple(torch.where(done[:, None], 0.0, x) for x in each) for each in past]  # type: ignore[misc]

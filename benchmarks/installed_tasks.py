@@ -2,8 +2,8 @@
 
     python -m benchmarks.installed_tasks [--json FILE]
 
-The environment is a virtual one of its own, made in an empty folder. It takes libraries, and this project, from where
-this process finds them, by a ``.pth`` file; the package itself is built and installed by its pip. ``tasks`` lists the
+The environment is a virtual one of its own, made in an empty folder. It takes libraries, pip, and this project from
+where this process finds them, by a ``.pth`` file; the package itself is built and installed into it by pip. ``tasks`` lists the
 names; both are trained for two iterations and resumed for one; one draws a film, measures and exports, the other walks
 in MuJoCo. The table says what each command returned, and its time. It takes some minutes on two cores.
 """
@@ -51,7 +51,7 @@ def prepare(folder: Path) -> Path:
     for name, like in NAMES.items():
         file = package / "my_tasks" / f"{name.replace('-', '_')}.py"
         subprocess.run([sys.executable, "-m", "warp_spo.tasks", "--new", str(file), "--like", like], check=True)
-    subprocess.run([sys.executable, "-m", "venv", str(folder / "fresh")], check=True)
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder / "fresh")], check=True)
     python = folder / "fresh" / "bin" / "python"
     say = "import sysconfig; print(sysconfig.get_paths()['purelib'])"
     site = subprocess.run([str(python), "-c", say], capture_output=True, text=True, check=True).stdout.strip()
