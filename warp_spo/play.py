@@ -4,9 +4,10 @@
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --measure        # and errors over 256 worlds
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --view           # in Newton's viewer, on a display
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --export policy  # policy.onnx, policy.pt, no film
+    python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --minari go2/walk-v0 --episodes 500  # a data set
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --mujoco         # 64 robots walk in MuJoCo; no film
 
-With ``--export`` or ``--mujoco`` a film is drawn only where ``--film`` or ``--view`` asks for it.
+With ``--export``, ``--minari`` or ``--mujoco`` a film is drawn only where ``--film`` or ``--view`` asks for it.
 Films are drawn without a display, on the device of the environment.
 """
 
@@ -22,6 +23,15 @@ from typing import Any
 
 
 def main(arguments: list[str] | None = None) -> int:
+    """Play the checkpoint that the arguments name; return the exit status, 130 after Ctrl-C."""
+    try:
+        return play(arguments)
+    except KeyboardInterrupt:
+        print("play: stopped by Ctrl-C; files that were not finished are not written", file=sys.stderr)
+        return 130
+
+
+def play(arguments: list[str] | None = None) -> int:
     """Play the checkpoint that the arguments name."""
     from .command_line import Parser, count, seconds
     from .env.tasks import TASKS, task
@@ -44,17 +54,19 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--view", action="store_true", help="show Newton's viewer")
     parser.add_argument("--mujoco", action="store_true", help="let 64 robots walk in MuJoCo, on the CPU")
     parser.add_argument("--export", type=Path, help="write NAME.onnx and NAME.pt, TorchScript")
+    parser.add_argument("--minari", metavar="ID", help="write a Minari data set of this name, such as go2/walk-v0")
+    parser.add_argument("--episodes", type=count, default=100, help="of the data set")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes", help=SET)
     parser.add_argument("--settings", type=Path, metavar="FILE.toml", help="such settings in a file")
     options = parser.parse_args(arguments)
 
     learning = load_learning(parser)
-    from .env import evaluation, export, recording, robots, settings
+    from .env import datasets, evaluation, export, recording, robots, settings
     from .env.task_files import build, short_name
     from .viewing import films
 
     own = short_name(options.task)
-    worlds = options.worlds if options.measure else 1
+    worlds = options.worlds if options.measure or options.minari else 1
     name = options.out or options.checkpoint.with_suffix("")
     try:
         chosen = task(options.task)
@@ -75,15 +87,24 @@ def main(arguments: list[str] | None = None) -> int:
     if options.measure:
         print(json.dumps(getattr(chosen, "measure", evaluation.episodes)(env, policy), indent=1))
     if options.export:
-        for file in export.save(runner, env, own, options.export):
-            print(file)
+        try:
+            for file in export.save(runner, env, own, options.export):
+                print(file)
+        except (ValueError, OSError) as error:
+            parser.error(str(error))
     if options.mujoco:
         try:
             print(json.dumps(walk_in_mujoco(runner, env, own, chosen), indent=1))
         except (ValueError, OSError) as error:
             parser.error(str(error))
-    if options.film is None and (options.export or options.mujoco) and not options.view:
-        return 0  # an export, or a run in MuJoCo, alone
+    if options.minari:
+        try:
+            made = datasets.record(env, policy, options.minari, options.episodes)
+        except (ValueError, OSError, ImportError) as error:
+            parser.error(str(error))
+        print(f"{options.minari}: {made.total_episodes} episodes, {made.total_steps} steps")
+    if options.film is None and (options.export or options.mujoco or options.minari) and not options.view:
+        return 0  # an export, a data set, or a run in MuJoCo, alone
     suffix = f".{options.film or 'gif'}"
     if getattr(chosen, "ROBOT", None) not in robots.NAMES or not hasattr(chosen, "CAMERA"):
         if options.view:
@@ -103,7 +124,7 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def checked(options: argparse.Namespace, chosen: Any) -> dict[str, str]:
+def checked(options: argparse.Namespace, chosen: Any) -> dict[str, Any]:
     """Return the arguments of the task's environment, after a look at what is asked for; make the film's folder.
 
     Raises:
@@ -128,7 +149,8 @@ def checked(options: argparse.Namespace, chosen: Any) -> dict[str, str]:
     for file in (options.out, options.export):
         if file is not None:
             file.parent.mkdir(parents=True, exist_ok=True)
-    return {} if options.trial is None else {"trial": options.trial}
+    given: dict[str, Any] = {} if options.trial is None else {"trial": options.trial}
+    return given | ({"final_observations": True} if options.minari else {})
 
 
 def robot_file(chosen: Any) -> Path:

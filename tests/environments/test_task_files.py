@@ -265,3 +265,35 @@ def test_trees_are_written_as_toml_and_read_again(tmp_path):
     assert settings.parse(["rewards.foot slip=-0.1", "a.b=1e-3", "a.c=(1, 2)", "d=text"]) == {
         "rewards": {"foot slip": -0.1}, "a": {"b": 1e-3, "c": (1, 2)}, "d": "text"
     }  # fmt: skip
+
+
+def test_measure_of_rough_ground_has_the_settings_of_the_environment(monkeypatch):
+    """Its trials were built without what --set had changed."""
+    from types import SimpleNamespace
+
+    from warp_spo.env import evaluation
+    from warp_spo.env.tasks import go2_rough
+
+    built = []
+    monkeypatch.setattr(go2_rough, "build", lambda worlds, device, **given: built.append(given))
+    monkeypatch.setattr(evaluation, "tracking", lambda env, policy: {})
+    monkeypatch.setattr(evaluation, "climb", lambda env, policy: {"climbed": 1.0})
+    go2_rough.measure(SimpleNamespace(num_envs=2, device="cpu", options={"dt": 4e-3}), None)
+    assert [given["trial"] for given in built] == [*go2_rough.TRIALS] and all(given["dt"] == 4e-3 for given in built)
+
+
+def test_an_environment_of_a_task_knows_its_settings():
+    from warp_spo.env.tasks import cartpole
+
+    assert cartpole.build(1, "cpu", rewards={"effort": -1.0}).options == {"rewards": {"effort": -1.0}}
+
+
+def test_ctrl_c_ends_play_with_a_line(monkeypatch, capsys):
+    from warp_spo import play
+
+    def stopped(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(play, "play", stopped)
+    assert play.main(["cartpole", "none.pt"]) == 130
+    assert capsys.readouterr().err.count("\n") == 1

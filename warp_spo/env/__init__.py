@@ -43,7 +43,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from . import actions, commands, events, observations, rewards, terminations
+from . import actions, commands, curricula, events, observations, rewards, terminations
 from .bounds import Bounds
 from .observations import Observation, TorchTerm
 from .world import World
@@ -59,6 +59,7 @@ __all__ = [
     "World",
     "actions",
     "commands",
+    "curricula",
     "events",
     "gymnasium",
     "make",

@@ -11,6 +11,8 @@ from ..errors import shown
 from ..recursions.step.joint_laws import DEFAULT_BOUND, FREE
 from ..scene.scene import Scene
 from ..trace.functions import AbstractScalar, clip, where
+from .actuator_nets import ActuatorNetwork
+from .compile.memory_layout import AGE, NET_TARGETS
 from .compile.vectors import Vector, find
 from .validation import check_optional_span
 from .world import World
@@ -146,6 +148,55 @@ class Effort(Position):
         """Return (entry, value) of what the actions set."""
         limits = w.value("joint_effort_limit")
         return [(dof, within(force, limits[dof])) for dof, force in Control.trace(self, w, action)]  # type: ignore[arg-type]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ActuatorNet:
+    """Position targets of learned actuators, ``target = offset + scale action``, whose network gives torques.
+
+    The network is evaluated before each step of the dynamics, of which each step of the environment has ``decimation``.
+    Torques are held within the joints' ``joint_effort_limit``.
+
+    Args:
+        network: an ``ActuatorNetwork`` of :mod:`warp_spo.env.actuator_nets`, the same for all its joints.
+        joints: regular expressions of labels; None: all joints of one coordinate. They have no drives.
+        scale, offset, clip: as :class:`Control`.
+    """
+
+    network: ActuatorNetwork
+    joints: Any = None
+    scale: Any = 1.0
+    offset: Any = "default"
+    clip: tuple[float, float] | None = None
+    array = NET_TARGETS
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "clip", check_optional_span("actions.ActuatorNet", "clip", self.clip))
+        if not isinstance(self.network, ActuatorNetwork):
+            raise TypeError(f"actions.ActuatorNet: network is {self.network!r}; expected an ActuatorNetwork")
+
+    def hinges(self, scene: Scene) -> list[int]:
+        """Return the hinge of each action."""
+        single = [i for i, hinge in enumerate(scene.hinges) if hinge.coord_count == hinge.dof_count == 1]
+        labels = [scene.joint_labels[i] for i in single]
+        chosen = (
+            range(len(single)) if self.joints is None else find("actions.ActuatorNet", "joint", labels, self.joints)
+        )
+        found = [single[i] for i in chosen]
+        gains = scene.values["joint_target_ke"][0] + scene.values["joint_target_kd"][0]
+        if driven := [scene.joint_labels[i] for i in found if gains[scene.qd_start[i]] > 0.0]:
+            raise ValueError(
+                f"actions.ActuatorNet: drives of {', '.join(map(shown, driven))} would act beside the network; "
+                "expected joints without: scene.with_values(joint_target_ke=..., joint_target_kd=...) with zeros there"
+            )
+        return found
+
+    def trace(self, w: World, action: Vector) -> list[tuple[int, Any]]:
+        """Return (entry, value) of what the actions set."""
+        w.sensor(AGE, 1, lambda world: world.keep(AGE, world.memory(AGE, 1) + 1.0))
+        return Position.trace(self, w, action)  # type: ignore[arg-type]
+
+    labels, entries, gears = Position.labels, Position.entries, Position.gears
 
 
 def within(force: Any, limit: Any) -> Any:

@@ -11,6 +11,7 @@ from ..errors import UnsupportedError, is_bool, shown
 from ..scene.scene import Scene
 from .bounds import Bounds
 from .compile.guard import BEYOND, NOT_FINITE
+from .curricula import ends_of
 from .observations import Observation, TorchTerm
 from .validation import check_function, check_mapping, check_number, check_whole
 
@@ -19,9 +20,9 @@ RESULTS = ("reward", "done", "time_out")
 
 
 def checked_terms(
-    observations: Any, rewards: Any, terminations: Any, events: Any
-) -> tuple[dict[str, list[Observation]], dict[str, tuple[float, Any]], dict[str, Any]]:
-    """Return observations, rewards and terminations by name; ValueError and TypeError as :class:`Env` says."""
+    observations: Any, rewards: Any, terminations: Any, metrics: Any, events: Any
+) -> tuple[dict[str, list[Observation]], dict[str, tuple[Any, Any]], dict[str, Any], dict[str, Any]]:
+    """Return observations, rewards, terminations and metrics by name; ValueError and TypeError as :class:`Env` says."""
     groups = check_mapping("Env", "observations", observations, "lists of terms")
     if not groups:
         raise ValueError("Env: observations is {}; expected a list of terms for each group")
@@ -37,15 +38,19 @@ def checked_terms(
     for name, reward in rewards.items():
         if not isinstance(reward, tuple | list) or len(reward) != 2 or not callable(reward[1]):
             raise TypeError(f"Env: rewards[{name!r}] is {reward!r}; expected (weight, term)")
-        check_number("Env", f"the weight of rewards[{name!r}]", reward[0])
+        for weight in ends_of(reward[0]):
+            check_number("Env", f"the weight of rewards[{name!r}]", weight)
     terminations = check_mapping("Env", "terminations", terminations, "terms")
     for name, term in terminations.items():
         check_function("Env", f"terminations[{name!r}]", term)
         if name in (NOT_FINITE, BEYOND):
             raise ValueError(f"Env: terminations has {name!r}, which every environment has; expected another name")
+    metrics = check_mapping("Env", "metrics", metrics, "terms")
+    for name, term in metrics.items():
+        check_function("Env", f"metrics[{name!r}]", term)
     if not isinstance(events, list | tuple):
         raise TypeError(f"Env: events is {events!r}; expected a list of those of warp_spo.env.events")
-    return groups, rewards, terminations
+    return groups, rewards, terminations, metrics
 
 
 def checked_scene(scene: Any) -> Scene:

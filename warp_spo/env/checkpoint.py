@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -18,10 +18,10 @@ STEPS = "steps"  # of the environment, after which a log comes
 CUT = "episode of a written length"  # in the log of the environment
 
 
-def level_names(events: Sequence[Any], commands: Any) -> list[str]:
-    """Return the names under which worlds remember how far they have come in curricula of events and commands."""
+def level_names(events: Sequence[Any], commands: Any, curricula: Iterable[str]) -> list[str]:
+    """Return the names under which worlds remember how far they have come: events', commands', ``curricula``."""
     names = [name for event in events for name in getattr(event, "levels", ())]
-    return names + ([] if getattr(commands, "level", None) is None else [LEVEL])
+    return [*names, *([] if getattr(commands, "level", None) is None else [LEVEL]), *curricula]
 
 
 def write_lengths(self: Env, value: torch.Tensor) -> None:
@@ -35,8 +35,9 @@ def write_lengths(self: Env, value: torch.Tensor) -> None:
 def levels(self: Env) -> dict[str, torch.Tensor]:
     """Return how far worlds have come in curricula, tensors [world, number] that may be written.
 
-    "terrain" has rows and columns of tiles, "command level" by how much ranges of commands have grown. Without a
-    curriculum the dictionary is empty.
+    "terrain" has rows and columns of tiles, "command level" by how much ranges of commands have grown, "curriculum
+    steps" the steps behind ``curricula.ByStep``, other names that begin so the levels of ``curricula.BySuccess``.
+    Without a curriculum the dictionary is empty.
     """
     return {name: self.memory(name) for name in self._levels}
 

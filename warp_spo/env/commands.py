@@ -10,6 +10,7 @@ import numpy as np
 from ..errors import shown
 from ..trace.functions import Condition, clip, where
 from .compile.vectors import Vector, vector
+from .curricula import Curriculum
 from .validation import Range, check_interval, check_number, check_optional_span, check_span
 from .world import World
 
@@ -43,6 +44,11 @@ class Level:
             raise ValueError(
                 f"commands.Level: no reward {self.reward!r}; expected one of {', '.join(map(shown, w.weights))}"
             )
+        if isinstance(w.weights[self.reward], Curriculum):
+            raise ValueError(
+                f"commands.Level: the weight of reward {self.reward!r} is a curriculum; expected a reward with a "
+                "number for its weight"
+            )
         level = self.first + w.memory(LEVEL, 1, reset=None)[0]
         if done is None:
             return level
@@ -59,7 +65,7 @@ class Velocity:
     """Velocity of the base in its own axes: forward, to the left [m/s], and rate of turning [rad/s].
 
     Args:
-        forward, left, turn: ranges of uniform numbers.
+        forward, left, turn: ranges of uniform numbers, or curricula of them.
         heading: None, or the range of a direction [rad] that replaces ``turn``: the rate of turning is then
             ``gain`` times what is missing, within the range ``turn``.
         gain: [1/s].
@@ -118,7 +124,7 @@ class Velocity:
         heading, moves = w.memory("command heading", 2, reset=None)
         missing = heading - w.heading
         missing = np.arctan2(np.sin(missing), np.cos(missing))
-        return vector([command[0], command[1], moves * clip(self.gain * missing, *self.turn)])
+        return vector([command[0], command[1], moves * clip(self.gain * missing, *map(w.at_level, self.turn))])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -126,7 +132,7 @@ class Uniform:
     """Numbers, each uniform in its range, such as the place that a hand is to reach.
 
     Args:
-        ranges: one for each number.
+        ranges: one for each number; curricula of ranges, too.
         seconds: range of the time until the next command.
     """
 

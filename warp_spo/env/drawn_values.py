@@ -12,6 +12,7 @@ from ..errors import shown
 from ..scene.actuators import RANGES
 from ..scene.ground import HEIGHTS
 from ..scene.scene import NOT_NEGATIVE, Scene
+from .curricula import ends_of
 from .validation import Range
 
 SMALLEST = 1e-12  # share of a body's largest moment of inertia that is rounding
@@ -41,7 +42,8 @@ def check_draws(scene: Scene, name: str, entries: Sequence[int], spans: Sequence
     rows = as_rows(name, values)
     rules: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {"scale": np.multiply, "add": np.add}
     drawn = rules.get(how, lambda row, draw: np.broadcast_to(draw, row.shape))
-    corners = np.array(list(itertools.product(*spans)))
+    ends = zip(*(2 * ends_of(each) if len(ends_of(each)) == 1 else ends_of(each) for each in spans), strict=True)
+    corners = np.array([corner for each in ends for corner in itertools.product(*each)])
     for entry in entries:
         found = np.array([drawn(rows[entry], corner) for corner in np.unique(corners, axis=0)])
         expected = _complaint(scene, name, rows[entry], found)

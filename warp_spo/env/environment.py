@@ -21,8 +21,10 @@ from ..runtime.launches import compile_side_by_side
 from ..runtime.torch_tensors import stream
 from ..scene.scene import Scene
 from . import arguments, checkpoint, failure_replay, seeding
+from .actions import ActuatorNet
 from .bounds import Bounds
 from .commands import COMMAND, HELD
+from .compile.actuator_launches import ActuatorLaunches
 from .compile.buffers import Storage
 from .compile.cuda_graphs import Part, Replay, run_all
 from .compile.fused_kernel import Launch
@@ -61,7 +63,9 @@ class Env(VecEnv):
         actions: one of :mod:`warp_spo.env.actions`, or several; the policy's numbers are theirs, one after the other.
         observations: for each group a list of terms, functions of a ``World`` or ``Observation``.
         rewards: (weight, term) by name. The reward is the sum of weight times term times the length of the step.
+            A weight is a number or a ``Curriculum`` of :mod:`warp_spo.env.curricula`.
         terminations: terms by name.
+        metrics: terms by name whose means over episodes are logged; nothing else depends on them.
         commands: None, or one of :mod:`warp_spo.env.commands`.
         events: of :mod:`warp_spo.env.events`.
         episode_length_s: after this time an episode ends with a time-out [s].
@@ -85,6 +89,7 @@ class Env(VecEnv):
         values: what events have made of the scene's values, torch tensors [world, ...] by name.
         dyn: the :class:`Dynamics`. has_commands: whether it gives commands.
         action_labels, action_clips: of each action, what it sets, and None or the (lowest, highest) that counts.
+        options: with which a task has changed its arguments, see ``settings.make_env``; {} without a task.
         observation_terms: of each group (name, size, ``Observation``) of its terms, in their order.
         num_envs, num_actions, num_obs, max_episode_length, episode_length_buf, device, cfg: as rsl_rl names them.
 
@@ -103,8 +108,9 @@ class Env(VecEnv):
         decimation: int = 4,
         actions: Any,
         observations: Mapping[str, Sequence[Any]],
-        rewards: Mapping[str, tuple[float, Callable]],
+        rewards: Mapping[str, tuple[Any, Callable]],
         terminations: Mapping[str, Callable] | None = None,
+        metrics: Mapping[str, Callable] | None = None,
         commands: Any = None,
         events: Sequence[Any] = (),
         episode_length_s: float = 20.0,
@@ -129,11 +135,12 @@ class Env(VecEnv):
         self.step_dt = self.dt * self.decimation
         self.first_world = check_whole("Env", "first_world", first_world, 0, 2**32 - 1)
         self.seed, self.cfg = check_whole("Env", "seed", seed, 0, 2**64 - 1), {} if cfg is None else cfg
+        self.options: dict[str, Any] = {}
         self.log_interval = check_whole("Env", "log_interval", log_interval, 1)
         self._passes, self.has_commands = arguments.checked_passes(scene, passes), commands is not None
         self.final = arguments.checked_bool("final_observations", final_observations)
         default, commands = arguments.checked_default(scene, default_q), arguments.checked_commands(commands)
-        terms = arguments.checked_terms(observations, rewards, terminations or {}, events)
+        terms = arguments.checked_terms(observations, rewards, terminations or {}, metrics or {}, events)
         self.bounds = arguments.checked_bounds(bounds)
         guard = Guard(self.bounds.limits(scene, self.dt, episode_length_s, list(terms[1]), terms[0]))
         self._layout = MemoryLayout(scene, default, self.step_dt, commands, changed_values(scene, events), guard)
@@ -144,7 +151,12 @@ class Env(VecEnv):
         store = self._store = self._allocate(tracing)
         self.q, self.qd, self.actions, self.chosen = (store.tensors[n] for n in ("q", "qd", "actions", "chosen"))
         self._tensors, self._controls, self._report = store.tensors, store.controls, StepReport(**store.written)
-        self._step_options = StepOptions(substeps=self.decimation, passes=self._passes)
+        substeps = 1 if self._learned else self.decimation  # networks are evaluated before each
+        self._step_options = StepOptions(substeps=substeps, passes=self._passes)
+        device = self.warp_device
+        self._networks = (
+            ActuatorLaunches(self._learned, self._layout, store, decimation, device) if self._learned else None
+        )
         self.values, self._actuator_state = store.values, self._delay_buffers(events)
         self._log = Log(self._layout, self.reward_names, self.termination_names, self.device, worlds)
         points, seen = len(scene.contact_points), tracing.observed_entries
@@ -161,18 +173,23 @@ class Env(VecEnv):
             self._compile()
         self.reset(seed=seed)
 
-    def _trace(self, actions: Any, groups: Any, rewards: Any, terminations: Any, commands: Any, events: Any) -> Tracing:
+    def _trace(
+        self, actions: Any, groups: Any, rewards: Any, terminations: Any, metrics: Any, commands: Any, events: Any
+    ) -> Tracing:
         """Return the traced stages of the checked terms; keep the names and counts of their numbers."""
         layout = self._layout
         self.action_labels = [label for part in actions for label in part.labels(self.scene)]
         self.action_clips = [part.clip for part in actions for _ in part.labels(self.scene)]
         self.num_actions = layout.action_count = len(self.action_labels)
         layout.action_arrays = {part.array for part in actions}
-        tracing = Tracing(layout, actions, groups, rewards, terminations, commands, list(events))
+        self._learned = [part for part in actions if isinstance(part, ActuatorNet)]
+        layout.networks = [(len(part.hinges(self.scene)), max(part.network.input_idx)) for part in self._learned]
+        layout.action_arrays |= {"tau"} if self._learned else set()
+        tracing = Tracing(layout, actions, groups, rewards, terminations, metrics, commands, list(events))
         tracing.run(self.max_episode_length, self.final)
         self.reward_names, self.termination_names = list(rewards), tracing.ends
         self.observation_terms = tracing.observation_terms
-        self.num_obs, self._levels = tracing.group_sizes, checkpoint.level_names(events, commands)
+        self.num_obs, self._levels = tracing.group_sizes, checkpoint.level_names(events, commands, layout.levels)
         self._values_later = any(isinstance(event, Values) and event.when != "start" for event in events)
         return tracing
 
@@ -309,6 +326,7 @@ class Env(VecEnv):
     def controls(self, actions: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return what actions set, "ctrl", "target_q" or "tau" [world, ...]; worlds remember them as their actions."""
         self.actions.copy_(arguments.checked_actions("Env.controls", actions, self.num_envs, self.action_labels))
+        self._after("act")
         self._launch("act")
         return {name: controls.clone() for name, controls in self._controls.items()}
 
@@ -405,8 +423,18 @@ class Env(VecEnv):
         """Compute the controls from the actions, and step the dynamics of all worlds in place."""
         if self._failures is not None:
             self._failures.keep()
+        self._after("act")
         self._launch("act")
         controls = self._controls
+        if self._networks is None:
+            self._step_dynamics(controls)
+        else:
+            self._networks.run(lambda: self._step_dynamics(controls), self._stream)
+        if "actuator_force" in self._tensors:
+            self.dyn.actuator_force(self.q, self.qd, controls["ctrl"], out=self._tensors["actuator_force"])
+
+    def _step_dynamics(self, controls: dict[str, torch.Tensor]) -> None:
+        """Take the steps of the dynamics that have the same controls."""
         self.dyn.step(
             self.q,
             self.qd,
@@ -420,8 +448,6 @@ class Env(VecEnv):
             report=self._report,
             out=(self.q, self.qd),
         )
-        if "actuator_force" in self._tensors:
-            self.dyn.actuator_force(self.q, self.qd, controls["ctrl"], out=self._tensors["actuator_force"])
 
     def _judge(self) -> None:
         if self._failures is not None and self._layout.users:
@@ -465,6 +491,8 @@ class Env(VecEnv):
         if any(kernel.reads_frames for kernel in kernels):
             self.dyn.frame_poses(self.q, frames, out=self._tensors["frame_pose"])
             self.dyn.frame_velocities(self.q, self.qd, frames, out=self._tensors["frame_velocity"])
+        if any(kernel.reads_jacobians for kernel in kernels):
+            self.dyn.jacobian(self.q, self._layout.jacobians, out=self._tensors["frame_jacobian"])
         if any(kernel.reads_accelerations for kernel in kernels):
             qdd, out = self._report.qdd, self._tensors["frame_acceleration"]
             self.dyn.frame_accelerations(self.q, self.qd, qdd, frames, out=out)

@@ -20,8 +20,8 @@ class Log:
 
     Means are over the worlds' last finished episodes, zero where there are none. "/episode/finished" is the number of
     worlds that have finished one, "/episode/whole" of those whose length counts: not where ``episode_length_buf`` was
-    written. "/not finite/" and "/beyond bounds/" count what ended worlds, by kind (action, state, reward, observation)
-    and by name, such as "/not finite/reward/alive".
+    written. "/metric/NAME" is the mean over an episode's steps. "/not finite/" and "/beyond bounds/" count what ended
+    worlds, by kind (action, state, reward, observation) and by name, such as "/not finite/reward/alive".
 
     Args:
         layout: where the memory is. rewards, ends: names. device: of the memory. worlds: their number.
@@ -33,6 +33,7 @@ class Log:
     def __init__(self, layout: MemoryLayout, rewards: list[str], ends: list[str], device: torch.device, worlds: int):
         means = {f"/reward/{name}": f"last reward {name}" for name in rewards}
         means |= {f"/termination/{name}": f"last end {name}" for name in ends}
+        means |= {f"/metric/{name}": f"last metric {name}" for name in layout.metrics}
         means["/episode/seconds"] = "last seconds"
         causes = [f"/{name}" for name in layout.guard.names]
         kinds = list(dict.fromkeys("/".join(name.split("/")[:3]) for name in causes))
@@ -101,6 +102,7 @@ def explain(env: Env, stages: dict[str, list[Launch]], users: dict[Any, tuple[st
         f"actions      {env.num_actions}: {', '.join(map(shown, env.action_labels))}",
         f"observations {', '.join(f'{shown(name)} {size}' for name, size in env.num_obs.items())}",
         f"rewards      {', '.join(map(shown, env.reward_names))}",
+        *([f"metrics      {', '.join(map(shown, env._layout.metrics))}"] if env._layout.metrics else []),
         f"ends         {', '.join(map(shown, env.termination_names))}, after {env.max_episode_length} steps",
         f"bounds       {', '.join(bounds_in_words(env._layout.guard.limits))}",
         f"variable     {', '.join(env.values) or 'nothing'}",

@@ -13,6 +13,7 @@ from ..scene.terrain import Tiles
 from ..trace.functions import where
 from .actions import actuator_labels
 from .compile.vectors import between, find, multiply, vector
+from .curricula import Curriculum, ends_of
 from .drawn_values import WHOLE, as_rows, check_draws
 from .validation import Range, check_function, check_interval, check_number, check_span, check_steps
 from .world import World
@@ -210,21 +211,25 @@ def terrain(tiles: Tiles, rows: int | None = None, level: bool = True) -> Reset:
 
 
 def push(
-    velocity: float = 0.5, vertical: float = 0.0, angular_velocity: float = 0.0, seconds: Range = (1.0, 3.0)
+    velocity: float | Curriculum = 0.5,
+    vertical: float | Curriculum = 0.0,
+    angular_velocity: float | Curriculum = 0.0,
+    seconds: Range = (1.0, 3.0),
 ) -> Interval:
     """Return pushes: the base's velocity changes by uniform numbers.
 
     Args:
         velocity: largest change along x and along y [m/s]. vertical: along z [m/s]. angular_velocity: about each axis
-            [rad/s]. seconds: range of the time between pushes.
+            [rad/s]. They may be curricula. seconds: range of the time between pushes.
     """
     for name, most in (("velocity", velocity), ("vertical", vertical), ("angular_velocity", angular_velocity)):
-        check_number("events.push", name, most, 0.0)
+        for end in ends_of(most):
+            check_number("events.push", name, end, 0.0)
 
     def change(w: World) -> None:
         rate = int(w.scene.qd_start[w.base])
         for i, most in enumerate((velocity, velocity, vertical, *3 * (angular_velocity,))):
-            if most > 0.0:
+            if most != 0.0:
                 w.qd[rate + i] += w.uniform(-most, most)
 
     return Interval(change, seconds)
@@ -243,7 +248,7 @@ def randomise(
     Args:
         name: of the value, such as "body_mass", "contact_friction", "joint_armature", "actuator_gain", "gravity".
         span: (lowest, highest) of the uniform draw; one pair for each number along the value's last axis, if it has
-            one, such as three of "body_com" [m].
+            one, such as three of "body_com" [m]. A curriculum of such a pair changes it.
         how: "scale", "add" or "set".
         names: regular expressions of bodies for values of bodies and contacts (those of their points, and of the pairs
             that they are in), of joints for values of joints, of actuators for values of actuators; None: all.
@@ -256,9 +261,16 @@ def randomise(
     """
     if how not in ("scale", "add", "set"):
         raise ValueError(f"events.randomise: how is {how!r}; expected 'scale', 'add' or 'set'")
-    spans: list[Any] = list(span) if np.ndim(span) == 2 else [span]
+    mixed = isinstance(span, list | tuple) and any(isinstance(each, Curriculum) for each in span)
+    several = mixed or (not isinstance(span, Curriculum) and np.ndim(span) == 2)
+    spans: list[Any] = list(span) if several else [span]  # type: ignore[arg-type]
     for each in spans:
         check_span("events.randomise", f"span of {name}", each)
+    if when == "start" and any(isinstance(each, Curriculum) for each in spans):
+        raise ValueError(
+            f"events.randomise: span of {name} is a curriculum and when is 'start', before its first step; expected "
+            "when='reset' or a range of seconds"
+        )
     if not isinstance(alike, bool):
         raise ValueError(f"events.randomise: alike is {alike!r}; expected True or False")
     combine = {"scale": lambda x, d: x * d, "add": lambda x, d: x + d, "set": lambda x, d: d}[how]

@@ -23,7 +23,8 @@ def describe(env: Env, name: str) -> dict[str, Any]:
 
     Action k sets ``offset[k] + scale[k] action``, a control of the actuator or the target or force of the joint
     ``actuators[k]``, whose gains are ``stiffness[k]`` and ``damping[k]``, after it is clipped to ``action_clip[k]``,
-    (lowest, highest), None without one. ``action_kind[k]`` says what is set, "ctrl", "target_q" or "tau";
+    (lowest, highest), None without one. ``action_kind[k]`` says what is set: "ctrl", "target_q", "tau", or
+    "net_targets", the position that a learned actuator is asked for, whose network is not in the file;
     ``armature[k]`` is the rotor's inertia at that joint. Targets of other joints that an action sets, too, such as
     those of a mimic, are not listed. No bias of an encoder is in the offset. ``delay_steps`` count steps of ``dt``; the
     policy runs every ``decimation`` of them.
@@ -102,7 +103,7 @@ def controls_of(env: Env) -> tuple[np.ndarray, np.ndarray, dict[str, list]]:
         if len(moved) != 1:
             raise ValueError(
                 f"export: action {label!r} sets {len(moved)} controls; expected one: a scale that is not 0, and a "
-                "range of actions, if clip= gives one"
+                "range of actions, if clip= gives one; task-space actions have no offset and scale to export"
             )
         ((array, i),) = moved
         scale.append((row[array][i] - rows[0][array][i]) / moved_by)

@@ -26,7 +26,7 @@ from ..runtime import launches
 from ..scene.scene import Scene
 from ..status import Status
 from . import training_files
-from .compile.buffers import FAULT
+from .compile.buffers import FAULT, ring_name
 
 if TYPE_CHECKING:
     from .environment import Env
@@ -82,7 +82,7 @@ def state_arrays(env: Env) -> dict[str, tuple[torch.Tensor, int]]:
     What the dynamics or a later stage of a step write before anything reads it is not among them; nor are actions.
     """
     own = {"q", "qd", "memory", "found", "tick", "episode_length", *(f"value_{name}" for name in env.values)}
-    own |= env._read_first - {ACTIONS}
+    own |= env._read_first - {ACTIONS} | {ring_name(number) for number in range(len(env._learned))}
     found = {name: each for name, each in env._store.worlds_of().items() if name in own and each[0].numel()}
     if env._layout.users:
         found[USER] = env._tensors[USER], 0

@@ -12,7 +12,7 @@ from . import arguments, checkpoint
 from .environment import Env
 
 
-def _spaces(env: Env) -> tuple[Any, Any]:
+def spaces_of(env: Env) -> tuple[Any, Any]:
     """Return Gymnasium's spaces of one world: observations, actions."""
     from gymnasium import spaces
 
@@ -58,7 +58,7 @@ def make_vector(env: Env, tensors: bool = False, autoreset_mode: Any = "SameStep
 
         def __init__(self) -> None:
             self.env, self.num_envs = env, env.num_envs
-            self.single_observation_space, self.single_action_space = _spaces(env)
+            self.single_observation_space, self.single_action_space = spaces_of(env)
             self.observation_space = batch_space(self.single_observation_space, env.num_envs)
             self.action_space = batch_space(self.single_action_space, env.num_envs)
             self._waiting = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)  # none in SAME_STEP
@@ -168,7 +168,7 @@ def make_single(env: Env, tensors: bool = False, autoreset_mode: Any = "SameStep
 
         def __init__(self) -> None:
             self.env, self._ended = env, False
-            self.observation_space, self.action_space = _spaces(env)
+            self.observation_space, self.action_space = spaces_of(env)
 
         def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
             """Start anew; with a seed as a new environment of that seed."""
@@ -206,7 +206,7 @@ def make_skrl(env: Env, observations: str | None = None, states: str | None = No
     for name in (own, whole):
         if name is not None and name not in groups:
             raise ValueError(f"env.skrl: unknown group {name!r}; expected one of {', '.join(map(shown, groups))}")
-    box = _spaces(env)[1]
+    box = spaces_of(env)[1]
 
     class SkrlWorlds(Wrapper):
         """All worlds of an ``Env``."""

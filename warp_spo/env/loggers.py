@@ -3,7 +3,8 @@
 Tags are those of rsl_rl, mjlab and Isaac Lab: ``Train/mean_reward``, ``Train/mean_episode_length`` [steps],
 ``Loss/NAME``, ``Policy/mean_std``, ``Perf/total_fps``, ``Perf/collection_time`` and ``Perf/learning_time`` [s];
 ``Episode_Reward/NAME``, the mean sum of an episode over the length of a whole one [1/s]; ``Episode_Termination/NAME``,
-the share of episodes that it ended; ``Curriculum/NAME``, the mean level; ``Metrics/not_finite_NAME``, a count.
+the share of episodes that it ended; ``Episode_Metrics/NAME``, the mean of a metric over an episode;
+``Curriculum/NAME``, the mean level; ``Metrics/not_finite_NAME``, a count.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 PREFIXES = {
     "loss/": "Loss/", "/termination/": "Episode_Termination/", "/not finite/": "Metrics/not_finite_",
+    "/metric/": "Episode_Metrics/",
 }  # fmt: skip
 
 
@@ -33,6 +35,8 @@ def tags(row: Mapping[str, float], env: Env, frames: int) -> dict[str, float]:
         for prefix, tag in PREFIXES.items():
             if name.startswith(prefix):
                 found[tag + name.removeprefix(prefix)] = value
+    if not row["/episode/finished"]:
+        found = {name: value for name, value in found.items() if not name.startswith("Episode_Metrics/")}
     if row["/episode/finished"]:
         found["Train/mean_reward"] = row["reward"]
         whole = env.max_episode_length * env.step_dt

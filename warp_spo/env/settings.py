@@ -110,13 +110,15 @@ def changed(held: Any, given: Any, place: str) -> Any:
     """Return something with settings in its place or in its parts.
 
     Parts are the entries of dictionaries, the fields of dataclasses, and the entries of lists by number; of a reward,
-    which is (weight, term), the weight.
+    which is (weight, term), the weight, which may have parts itself.
 
     Raises:
         ValueError: a name is unknown, the message has the nearest; or a value is of another kind than the one before.
     """
     if isinstance(given, Mapping):
         parts = _parts(held)
+        if not parts and _is_reward(held):
+            return changed(held[0], given, place), held[1]  # its weight is a curriculum
         if not parts:
             raise ValueError(f"settings: {place} is {_short(held)}, which has no {', '.join(map(str, given))}")
         new = {}
@@ -124,7 +126,9 @@ def changed(held: Any, given: Any, place: str) -> Any:
             key = _known(str(name), parts, place)
             new[key] = changed(parts[key], value, f"{place}.{key}")
         return _with_parts(held, new, place)
-    if isinstance(held, tuple) and len(held) == 2 and callable(held[1]):
+    if _is_reward(held) and dataclasses.is_dataclass(held[0]):
+        return _alike(given, 1.0, place), held[1]
+    if _is_reward(held):
         return _alike(given, held[0], place), held[1]
     if callable(held) or dataclasses.is_dataclass(held) or isinstance(held, Mapping):
         names = ", ".join(map(str, _parts(held))) or "none"
@@ -149,7 +153,9 @@ def make_env(scene: Any, worlds: int, device: Any, options: Mapping[str, Any], *
     for name, value in options.items():
         name = _known(name, dict.fromkeys([*own, *known]), "")
         found[name] = changed(own[name], value, name) if name in own else value
-    return Env(scene, worlds, device, **found)
+    env = Env(scene, worlds, device, **found)
+    env.options = dict(options)
+    return env
 
 
 def arguments(chosen: Any, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -186,6 +192,11 @@ def text_of(tree: Mapping[str, Any]) -> str:
 
 
 # -- inside --------------------------------------------------------------------------------------------------------
+def _is_reward(held: Any) -> bool:
+    """Return whether it is a reward: (weight, term)."""
+    return isinstance(held, tuple) and len(held) == 2 and callable(held[1])
+
+
 def _parts(held: Any) -> dict[Any, Any]:
     if isinstance(held, Mapping):
         return dict(held)

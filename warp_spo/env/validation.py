@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import as_integer
+from .curricula import Curriculum
 
 Range = tuple[float, float]
 
@@ -41,7 +42,14 @@ def check_positive(call: str, name: str, value: Any, endless: bool = False) -> f
 
 
 def check_span(call: str, name: str, value: Any, least: float = -math.inf) -> Range:
-    """Return a range (lowest, highest) of finite numbers; ValueError for anything else, or one below ``least``."""
+    """Return a range (lowest, highest) of finite numbers; ValueError for anything else, or one below ``least``.
+
+    A curriculum of ranges is returned as it is, if both its ranges are fine.
+    """
+    if isinstance(value, Curriculum):
+        for end in (value.first, value.last):
+            check_span(call, name, end, least)
+        return value  # type: ignore[return-value]
     try:
         low, high = (_number(end) for end in value)
     except (TypeError, ValueError):
@@ -66,7 +74,9 @@ def check_optional_span(call: str, name: str, value: Any) -> Range | None:
 
 
 def check_interval(call: str, value: Any) -> Range:
-    """Return a range of seconds above zero, as :func:`check_span`."""
+    """Return a range of seconds above zero, as :func:`check_span`; no curriculum."""
+    if isinstance(value, Curriculum):
+        raise ValueError(f"{call}: the range of seconds is a curriculum; expected a range (lowest, highest)")
     low, high = check_span(call, "the range of seconds", value, 0.0)
     if not high > 0.0:
         raise ValueError(f"{call}: the range of seconds is {value!r}; expected a highest above zero")

@@ -18,6 +18,7 @@ from .compile.fused_kernel import FusedKernel
 from .compile.memory_layout import LEFT_OUT
 from .compile.returned import numbers
 from .compile.vectors import Vector, as_scalar, as_value, cross, find, rotate, rotate_back, vector
+from .curricula import Curriculum, remembered_mean
 from .feet import Feet, feet
 
 if TYPE_CHECKING:
@@ -117,9 +118,28 @@ class World:
         return self.memory("action 2", self._layout.action_count)
 
     @property
-    def weights(self) -> dict[str, float]:
-        """The weights of the rewards by name, numbers."""
+    def weights(self) -> dict[str, Any]:
+        """The weights of the rewards by name, numbers and curricula."""
         return self._layout.weights
+
+    def at_level(self, value: Any) -> Any:
+        """Return the number that a curriculum gives this world now; what is none is returned as it is."""
+        if not isinstance(value, Curriculum):
+            return value
+        layout, name = self._layout, value.level.name
+        remembered = self.memory(name, 1, reset=None)[0]
+        layout.levels.setdefault(name, value.level)
+        if self._stage.name == "judge" and layout.judged is not None:
+            remembered = layout.grown(name)
+        return value.value(value.level.value(remembered))
+
+    def episode_mean(self, call: str, term: str) -> Any:
+        """Return the mean of a metric, or of a reward before its weight, over the steps of the episode so far.
+
+        Args:
+            call: that asks, in errors. term: name.
+        """
+        return remembered_mean(call, self, term)
 
     @property
     def has_commands(self) -> bool:
@@ -313,6 +333,15 @@ class World:
         rates = vector(self._scalar("frame_velocity", 6 * at + i) for i in range(6))
         return Frame(pose[:3], pose[3:], rates[:3], rates[3:])
 
+    def jacobian(self, name: Any) -> np.ndarray:
+        """Return the velocity of a frame's origin, then its angular velocity, per unit qd [6, dof], inertial axes.
+
+        ``name`` as :meth:`frame`.
+        """
+        at, dofs = self._layout.jacobian(name), self.scene.dof_count
+        entries = (self._scalar("frame_jacobian", 6 * dofs * at + i) for i in range(6 * dofs))
+        return vector(entries).reshape(6, dofs)
+
     def imu(self, name: Any) -> Imu:
         """Return what an inertial measurement unit at a frame measures; ``name`` as :meth:`frame`.
 
@@ -346,7 +375,8 @@ class World:
 
     # -- random numbers --------------------------------------------------------------------------------------------
     def uniform(self, low: Any = 0.0, high: Any = 1.0) -> Any:
-        """Return a new random number between ``low`` and ``high``."""
+        """Return a new random number between ``low`` and ``high``, which may be curricula."""
+        low, high = self.at_level(low), self.at_level(high)
         return low + (high - low) * AbstractScalar(self._stage.draw())
 
     def normal(self, deviation: Any = 1.0) -> Any:

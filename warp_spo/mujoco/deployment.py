@@ -179,6 +179,11 @@ def complete(spec: mujoco.MjSpec, found: dict[str, Any]) -> None:
         if label in own or label.split("/")[-1] in own:
             continue
         kind = found.get("action_kind", ["ctrl"] * (k + 1))[k]
+        if kind == "net_targets":
+            raise ValueError(
+                f"Deployment: {label!r} has a learned actuator, whose network is not in the file; expected a policy "
+                "whose actions are of servos, drives or motors; a loop of your own may evaluate the network"
+            )
         if kind == "ctrl":
             raise ValueError(
                 f"Deployment: the robot has no actuator {label!r}, which the policy controls; it has "

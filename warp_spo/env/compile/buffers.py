@@ -8,11 +8,16 @@ import numpy as np
 import torch
 
 from .fused_kernel import COLUMN, COUNT, FOUND, INT, LONG, MASK, ROW, SHARED, Buffer
-from .memory_layout import MemoryLayout
+from .memory_layout import NET_TARGETS, MemoryLayout
 
 CONTACT_ARRAYS = {"contact_f": 3, "contact_gap": 1, "contact_slip": 1}  # entries of each point, and of each pair
 FAULT = "fault"  # the guard's code of what has ended a world in this step; no part of a state
 LINE = 32  # scalars of a line of the caches
+
+
+def ring_name(number: int) -> str:
+    """Return the name of the array in which the errors and rates of a learned actuator are kept."""
+    return f"actuator net {number}"
 
 
 class Storage:
@@ -120,8 +125,11 @@ class Storage:
     def _add_controls(self, layout: MemoryLayout, read: set[str]) -> None:
         for name in sorted(layout.action_arrays):
             self.controls[name] = self._add(name, self._zeros(self.worlds, layout.control_sizes[name]))
-        if "target_q" in self.controls:
-            self._firsts["target_q"] = self._firsts["q"]
+        for name in {"target_q", NET_TARGETS} & self.controls.keys():
+            self._firsts[name] = self._firsts["q"]
+        for number, (joints, slots) in enumerate(layout.networks):
+            if slots:
+                self._add(ring_name(number), self._zeros(2 * slots, self.worlds, joints), COLUMN)
         if "actuator_force" in read:
             self._add("actuator_force", self._zeros(self.worlds, layout.scene.dof_count))
 
@@ -135,6 +143,9 @@ class Storage:
         if frames:
             self._add("frame_pose", self._zeros(worlds, frames, 7))
             self._add("frame_velocity", self._zeros(worlds, frames, 6))
+        if layout.jacobians:
+            size = len(layout.jacobians)
+            self._add("frame_jacobian", self._zeros(worlds, size, 6, layout.scene.dof_count))
         if read & {"frame_acceleration", "qdd"}:
             self.written["qdd"] = self._add("qdd", self._zeros(worlds, layout.scene.dof_count))
         if "frame_acceleration" in read:

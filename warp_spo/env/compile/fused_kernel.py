@@ -222,7 +222,8 @@ class FusedKernel:
         kernel = native.kernel(f"env_{self.name}", text, [(name, 1) for name in names], wp.float32)
         frames = "frame_pose" in touched or "frame_velocity" in touched
         arrays, accelerations = [buffers[name].warp() for name in names], "frame_acceleration" in touched
-        return Launch(kernel, arrays, emitter.operations, device, self.threads, frames, accelerations)
+        jacobians = "frame_jacobian" in touched
+        return Launch(kernel, arrays, emitter.operations, device, self.threads, frames, accelerations, jacobians)
 
     def _emit(
         self, emitter: Emitter, wide: dict[str, list[tuple[int, int]]], buffers: dict[str, Buffer]
@@ -259,7 +260,7 @@ class Launch(NamedTuple):
 
     Attributes:
         operations: of one thread. threads: of a world that has rows; 0: one.
-        reads_frames, reads_accelerations: whether it reads frames, and their accelerations.
+        reads_frames, reads_accelerations, reads_jacobians: whether it reads frames, and what is said of them.
     """
 
     kernel: wp.Kernel
@@ -269,6 +270,7 @@ class Launch(NamedTuple):
     threads: int
     reads_frames: bool
     reads_accelerations: bool
+    reads_jacobians: bool
 
     def __call__(self, worlds: int) -> None:
         """Launch the kernel on Warp's current stream."""

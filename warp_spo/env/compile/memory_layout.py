@@ -12,6 +12,8 @@ from .guard import Guard
 from .vectors import find
 
 ROUNDING = 1e-9  # share of a time in float64 that is its rounding
+AGE = "actuator net steps"  # name under which a world with learned actuators remembers its steps since the start
+NET_TARGETS = "net_targets"  # array of the positions that learned actuators are asked for [world, coordinate]
 LEFT_OUT: Any = object()
 """In place of a value at a reset: zero, unless somebody says it."""
 
@@ -21,13 +23,17 @@ class MemoryLayout:
 
     Attributes:
         memory: (start, size, value at a reset) of what worlds remember, by name. frames: that terms ask for.
-        action_arrays: that actions set: "ctrl", "target_q", "tau". biased: hinges whose encoders have a bias.
+        jacobians: frames whose Jacobians they ask for.
+        action_arrays: that actions set: "ctrl", "target_q", "tau", "net_targets". networks: joints of each learned
+            actuator, and how many substeps it looks back. biased: hinges whose encoders have a bias.
         sensors: (size, value at a reset, function that keeps it) of memory that each step brings up to date, by name.
         users: (stage, start) of the numbers of each user's term in torch.
         drawn: functions that return memory that is drawn once, by name. observations: a number for each of those that
             remember something.
         tables: numbers that all worlds share, by their names in kernels. table_names: names that terms give them.
-        weights: of rewards.
+        weights: of rewards. metrics: terms by name.
+        levels: of curricula, by the names of what they follow. judged: the world of the stage "judge", and whether its
+            episode ended with numbers that count; None before it is known.
         values: names of the scene's values that events change. unequal: of those that stages read, and that differ
             between worlds of the scene itself.
         guard: what ends worlds whose numbers are out of bounds.
@@ -54,17 +60,22 @@ class MemoryLayout:
         self.guard = guard
         self.action_count = 0
         self.action_arrays: set[str] = set()
+        self.networks: list[tuple[int, int]] = []
         self.biased: list[int] = []
         self.memory: dict[str, tuple[int, int, float | None]] = {}
         self.memory_size = 0
         self.unsaid: set[str] = set()  # names whose value at a reset nobody has said
         self.unequal: set[str] = set()
         self.frames: list[Any] = []
+        self.jacobians: list[Any] = []
         self.drawn: dict[str, Any] = {}
         self.observations: dict[Any, int] = {}
         self.tables: dict[str, np.ndarray] = {}
         self.table_names: list[str] = []
-        self.weights: dict[str, float] = {}
+        self.weights: dict[str, Any] = {}
+        self.metrics: dict[str, Any] = {}
+        self.levels: dict[str, Any] = {}
+        self.judged: tuple[Any, Any] | None = None
         self.users: dict[Any, tuple[str, int]] = {}
         self.user_size = 0
         self.sensors: dict[str, tuple[int, float | None, Any]] = {}
@@ -102,6 +113,13 @@ class MemoryLayout:
         steps = seconds / self.step_dt
         return round(steps) if abs(steps - round(steps)) <= ROUNDING * max(1.0, steps) else steps
 
+    def grown(self, name: str) -> Any:
+        """Return what a world remembers of a level after the step that "judge" looks at, which keeps it."""
+        w, ended = self.judged  # type: ignore[misc]
+        if name not in w.kept:
+            w.keep(name, [self.levels[name].update(w, w.memory(name, 1, reset=None)[0], ended)])
+        return w.kept[name][0]
+
     def output(self, result: str) -> str:
         """Return the name under which kernels write a result: its number, so that no user's name reaches a compiler."""
         return self.outputs.setdefault(result, f"out_{len(self.outputs)}")
@@ -138,8 +156,16 @@ class MemoryLayout:
             self.frames.append(name)
         return self.frames.index(name)
 
+    def jacobian(self, name: Any) -> int:
+        """Return the number of a frame among those whose Jacobians terms ask for."""
+        frame = self.frames[self.frame(name)]
+        if frame not in self.jacobians:
+            self.jacobians.append(frame)
+        return self.jacobians.index(frame)
+
     @property
     def control_sizes(self) -> dict[str, int]:
         """How many entries each array has that actions may set."""
         scene = self.scene
-        return {"ctrl": len(scene.actuators), "tau": scene.dof_count, "target_q": scene.coord_count}
+        targets = dict.fromkeys(("target_q", NET_TARGETS), scene.coord_count)
+        return {"ctrl": len(scene.actuators), "tau": scene.dof_count, **targets}

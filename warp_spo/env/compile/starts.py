@@ -18,6 +18,7 @@ from ...recursions.step.actuation import actuator_force
 from ...recursions.step.joint_laws import JointLaws
 from ...trace.scalars import Graph, Value, less, select
 from ..world import World
+from .memory_layout import NET_TARGETS
 from .vectors import as_value
 
 MOVED = ("contact_gap", "contact_slip")  # reports that follow from the state
@@ -99,6 +100,9 @@ def reports(w: World, parts: Iterable[Any], wanted: set[tuple[str, int]]) -> dic
         for part in parts:
             size = len(part.labels(w.scene))
             controls.setdefault(part.array, {}).update(part.trace(w, w.action[at : at + size]))
+            if part.array == NET_TARGETS:
+                dofs = (int(w.scene.qd_start[hinge]) for hinge in part.hinges(w.scene))
+                controls.setdefault("tau", {}).update(dict.fromkeys(dofs, 0.0))  # before its first substep
             at += size
         found |= {(array, entry): as_value(x) for array, each in controls.items() for entry, x in each.items()}
         if "actuator_force" in arrays:

@@ -48,11 +48,12 @@ class Tracing:
         groups: dict[str, list[Observation]],
         rewards: dict[str, tuple[float, Any]],
         terminations: dict[str, Any],
+        metrics: dict[str, Any],
         commands: Any,
         events: list,
     ):
         self.layout, self.actions, self.groups, self.guard = layout, actions, groups, layout.guard
-        layout.weights = {name: weight for name, (weight, _) in rewards.items()}
+        layout.weights, layout.metrics = {name: weight for name, (weight, _) in rewards.items()}, metrics
         self.rewards, self.terminations, self.commands, self.events = rewards, terminations, commands, events
         for event in events:
             if not isinstance(event, Reset | Interval | Values | Start):
@@ -114,6 +115,8 @@ class Tracing:
                 update(self.judge)
                 self.guard.hold(self.judge, [name], self.bad)
         self._first()
+        for name in self.layout.levels:
+            self.layout.grown(name)
         self._close()
         self._reset()
 
@@ -150,7 +153,7 @@ class Tracing:
         total: Any = 0.0
         earned = {}
         for name, (weight, term) in self.rewards.items():
-            value = weight * self.layout.step_dt * one_number(f"reward {name!r} returned", term(w))
+            value = w.at_level(weight) * self.layout.step_dt * one_number(f"reward {name!r} returned", term(w))
             total = total + value
             checks.append(self.guard.check(f"reward/{name}", [value]))
             earned[name] = value
@@ -164,6 +167,7 @@ class Tracing:
         ends = {name: condition(f"termination {name!r} returned", term(w)) for name, term in self.terminations.items()}
         ends |= self.guard.ends(fault)
         self.bad, self.ended = bad, self.guard.mend(w, state)
+        measured = self._measure(w, bad)
         self.guard.hold(w, list(w.kept), bad)
         terminated = bad
         for name in self.terminations:
@@ -177,13 +181,27 @@ class Tracing:
         stage.store("episode_length", 0, as_value(where(done, 0.0, length)))
         found = {"seconds": w.time, **{f"reward {name}": w.kept[f"sum reward {name}"][0] for name in self.rewards}}
         found |= {f"end {name}": where(ends[name], 1.0, 0.0) for name in self.ends}
+        found |= measured
         finished = [(f"last {name}", value) for name, value in found.items()]
         finished.append(("episodes", w.memory("episodes", 1, reset=None)[0] + 1.0))
         olds = [w.memory(name, 1, reset=None)[0] for name, _ in finished]
         news = choose(done, [value for _, value in finished], olds, "end")
         for (name, _), value in zip(finished, news, strict=True):
             w.keep(name, [value])
+        self.layout.judged = w, done & ~bad
         self.after = self._start(w, done, intervals=True)
+
+    def _measure(self, w: World, bad: Condition) -> dict[str, Any]:
+        """Add up the metrics of a step, and return their means over the episode by name.
+
+        Steps in which a metric is not finite do not count for it.
+        """
+        for name, term in self.layout.metrics.items():
+            value = one_number(f"metric {name!r} returned", term(w))
+            counts = within([value], LARGEST) & ~bad
+            for memory, more in ((f"sum metric {name}", value), (f"steps of metric {name}", 1.0)):
+                w.keep(memory, w.memory(memory, 1) + where(counts, more, 0.0))
+        return {f"metric {name}": w.episode_mean("Env", name) for name in self.layout.metrics}
 
     def _start(self, w: World, done: Condition, intervals: bool) -> World:
         """Start worlds anew where ``done`` holds; let events happen and draw commands in the others.

@@ -68,9 +68,12 @@ def build(worlds: int, device: Any = None, seed: int = 0, trial: str | None = No
 
 
 def measure(env: Env, policy: Any) -> dict[str, float]:
-    """Return the share of robots that climb out of each of ``TRIALS``, and the errors of tracking on all tiles."""
+    """Return the share of robots that climb out of each of ``TRIALS``, and the errors of tracking on all tiles.
+
+    Trials have the settings of ``env``.
+    """
     found = evaluation.tracking(env, policy)
     for trial in TRIALS:
-        tried = build(env.num_envs, env.device, seed=7, trial=trial)
+        tried = build(env.num_envs, env.device, seed=7, trial=trial, **env.options)
         found[f"climb {trial}"] = evaluation.climb(tried, policy)["climbed"]
     return found

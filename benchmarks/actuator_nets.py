@@ -1,0 +1,128 @@
+"""What learned actuators cost in a step of ``go2-flat``, and whether their torques are those of torch.
+
+    python -m benchmarks.actuator_nets [--worlds 4096] [--device cuda:0] [--json FILE]
+
+``servos``: the task as it is, whose step takes all substeps in one launch. ``split``: a network of one layer, which
+costs next to nothing, so that the difference is what launches of single substeps cost. ``network``: three layers of 32
+units for twelve joints, errors and rates now and two and four substeps ago. All are graphs of a whole step, replayed in
+turns. ``kernels``: the four launches of the network alone, by the threads of a block. The bound is that of float32
+products and sums: 2 x 2272 operations a joint and substep at 132 multiprocessors x 128 x 2 x 1.98 GHz.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import statistics
+import sys
+from typing import Any
+
+import numpy as np
+import torch
+
+from warp_spo.env import Env, actions, learning
+from warp_spo.env.actuator_nets import ActuatorNetwork
+from warp_spo.env.compile import actuator_launches
+from warp_spo.env.tasks import go2_flat
+
+from . import command_line, env_times
+
+TURNS = 7
+PEAK = 132 * 128 * 2 * 1.98e3  # operations a microsecond
+BLOCKS = (64, 128, 256)
+STEPS = 100
+MOST = 1.2  # times the step with servos
+SAME = 1e-6  # of the largest torque
+
+
+def network(sizes: tuple[int, ...], lags: tuple[int, ...]) -> ActuatorNetwork:
+    """Return a network with random weights, as torch draws those of its layers."""
+    rng = np.random.default_rng(0)
+    weights = [rng.uniform(-1, 1, size=(o, i)) / np.sqrt(i) for i, o in itertools.pairwise(sizes)]
+    biases = [rng.uniform(-1, 1, size=o) / np.sqrt(i) for i, o in itertools.pairwise(sizes)]
+    return ActuatorNetwork(weights, biases, "softsign", input_idx=lags, vel_scale=0.1, torque_scale=20.0)
+
+
+def build(worlds: int, device: Any, net: ActuatorNetwork | None, **options: Any) -> Env:
+    """Return the task, its servos replaced by a network."""
+
+    def make(scene: Any, worlds: int, device: Any, options: Any, **own: Any) -> Env:
+        acts = own.pop("actions") if net is None else actions.ActuatorNet(net, scale=0.25)
+        own.pop("actions", None)
+        return Env(scene, worlds, device, actions=acts, **own, **options)
+
+    held, go2_flat.make_env = go2_flat.make_env, make
+    try:
+        return go2_flat.build(worlds, device, **options)
+    finally:
+        go2_flat.make_env = held
+
+
+def compare(device: Any, net: ActuatorNetwork, worlds: int = 64) -> float:
+    """Return the largest error of torques through STEPS steps, as a share of the largest torque."""
+    env = build(worlds, device, net, graph=False)
+    recorded: list[list[torch.Tensor]] = []
+    step = env._step_dynamics
+
+    def record(controls: dict[str, torch.Tensor]) -> None:
+        recorded.append([each.clone() for each in (env.q, env.qd, controls["tau"])])
+        step(controls)
+
+    env._step_dynamics = record  # type: ignore[method-assign]
+    limit = torch.tensor(env.scene.values["joint_effort_limit"][0, 6:], device=env.device)
+    generator, past, worst, largest = torch.Generator().manual_seed(0), [], 0.0, 0.0
+    zero = torch.zeros(worlds, 12, device=env.device)
+    for _ in range(STEPS):
+        recorded.clear()
+        done = env.step(torch.randn(worlds, 12, generator=generator).to(env.device))[2].bool()
+        target = env._tensors["net_targets"][:, 7:]
+        for q, qd, tau in recorded:
+            past = [(target - q[:, 7:], qd[:, 6:]), *past[: max(net.input_idx)]]
+            seen = [past[lag] if lag < len(past) else (zero, zero) for lag in net.input_idx]
+            errors, rates = (torch.stack([each[i] for each in seen], dim=-1) for i in (0, 1))
+            torque = net.torque(errors.double(), rates.double()).clamp(-limit, limit)  # float32 may be TF32 on a GPU
+            worst = max(worst, float((tau[:, 6:] - torque).abs().max()))
+            largest = max(largest, float(torque.abs().max()))
+        past = [tuple(torch.where(done[:, None], 0.0, x) for x in each) for each in past]  # type: ignore[misc]
+    return worst / largest
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = command_line.parser("actuator_nets", __doc__)
+    parser.add_argument("--worlds", type=int, default=4096)
+    options = parser.parse_args(arguments)
+    device = learning.pick_device(options.device)
+    whole, tiny = network((6, 32, 32, 32, 1), (0, 2, 4)), network((2, 1), (0,))
+    error = compare(device, whole)
+    made = {name: build(options.worlds, device, net) for name, net in
+            (("servos", None), ("split", tiny), ("network", whole))}  # fmt: skip
+    for env in made.values():
+        assert env_times.drive(env, env_times.DRIVEN), "observations that are not finite"
+    turns = [{name: env_times.time_of(env.replay, device) for name, env in made.items()} for _ in range(TURNS)]
+    found: dict[str, Any] = {name: statistics.median(turn[name] for turn in turns) for name in made}
+    found["dynamics, servos"] = env_times.time_of(env_times.as_graph(made["servos"]._physics, device), device)
+    found["dynamics, network"] = env_times.time_of(env_times.as_graph(made["network"]._physics, device), device)
+    nets = made["network"]._networks
+    assert nets is not None
+    for block in BLOCKS:
+        actuator_launches.BLOCK = block
+        alone = env_times.as_graph(lambda: nets.run(lambda: None, made["network"]._stream), device)
+        found[f"kernels, blocks of {block}"] = statistics.median(env_times.time_of(alone, device) for _ in range(TURNS))
+    products = sum(w.size for w in whole.weights)
+    found["bound of the kernels"] = 4 * options.worlds * 12 * 2 * products / PEAK
+    found["network over servos"] = found["network"] / found["servos"]
+    found["split over servos"] = found["split"] / found["servos"]
+    found["error of torques"] = error
+    found["device"] = torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else "cpu"
+    for name, value in found.items():
+        unit = "" if isinstance(value, str) or "over" in name or "error" in name else " us"
+        print(f"{name:28} {value if isinstance(value, str) else f'{value:10.4g}'}{unit}", flush=True)
+    fine = error < SAME
+    print(f"torques within {SAME:g}: {fine}; a step at most {MOST} times: {found['network over servos'] <= MOST}")
+    if options.json:
+        options.json.write_text(json.dumps(found, indent=1))
+    return 0 if fine else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
