@@ -200,6 +200,11 @@ class Env(VecEnv):
         return self._layout.default_q
 
     @property
+    def is_capturable(self) -> bool:
+        """Whether steps in a row can be captured in one CUDA graph; known after the first step."""
+        return self.replay.is_capturable
+
+    @property
     def unwrapped(self) -> Env:
         """This environment."""
         return self

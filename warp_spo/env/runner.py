@@ -57,11 +57,39 @@ class Runner(OnPolicyRunner):
         finished: the last whole iteration. unwritten: by name of a file why it could not be written.
     """
 
+    current_learning_iteration: int
     resumed, finished = False, -1
 
     def __init__(self, env: Env, settings: dict[str, Any], device: str):
         super().__init__(env, settings, None, device=device)
         self.stop, self.unwritten = StopRequest(), dict[str, str]()
+
+    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
+        """Learn for so many iterations, as rsl_rl does, with rollouts that may be one launch."""
+        alg: Any = self.alg
+        if getattr(alg, "obstacle", "other algorithm"):
+            return super().learn(num_learning_iterations, init_at_random_ep_len)
+        if init_at_random_ep_len:
+            lengths = self.env.episode_length_buf
+            self.env.episode_length_buf = torch.randint_like(lengths, high=int(self.env.max_episode_length))
+        obs = self.env.get_observations().to(self.device)
+        alg.train_mode()
+        if self.is_distributed:
+            alg.broadcast_parameters()
+        self.logger.init_logging_writer()
+        first = self.current_learning_iteration
+        for iteration in range(first, first + num_learning_iterations):
+            began = time.time()
+            obs = alg.collect(self.env, obs)
+            wait(self.device)
+            collected = time.time()
+            losses = alg.update()
+            self.current_learning_iteration = iteration
+            self.logger.log(
+                it=iteration, start_it=first, total_it=first + num_learning_iterations, collect_time=collected - began,
+                learn_time=time.time() - collected, loss_dict=losses, learning_rate=alg.learning_rate,
+                action_std=alg.deviation, rnd_weight=None,
+            )  # fmt: skip
 
     def save(self, path: str, infos: dict | None = None) -> None:
         """Save networks, the optimizer's state, and how far this process's worlds have come in curricula."""
@@ -254,6 +282,12 @@ def describe_end(ending: Ending) -> str:
     words += [f"stopped by {ending.fault}"] if ending.fault else []
     words += [f"not written: {', '.join(ending.unwritten)}"] if ending.unwritten else []
     return "; ".join(words)
+
+
+def wait(device: Any) -> None:
+    """Wait for a GPU, so that times are those of the work; a CPU is never behind."""
+    if torch.device(device).type == "cuda":
+        torch.cuda.synchronize(device)
 
 
 def _on_host(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
