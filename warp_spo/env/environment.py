@@ -201,8 +201,8 @@ class Env(VecEnv):
 
     @property
     def is_capturable(self) -> bool:
-        """Whether steps in a row can be captured in one CUDA graph; known after the first step."""
-        return self.replay.is_capturable
+        """Whether a CUDA graph can hold steps in a row: not where ``step`` is replaced; known after the first one."""
+        return getattr(self.step, "__func__", None) is Env.step and self.replay.is_capturable
 
     @property
     def unwrapped(self) -> Env:

@@ -30,6 +30,7 @@ from .training_log import TrainingLog
 from .validation import check_folder, check_number, check_positive, check_whole
 
 DEVIATIONS = (0.05, 2.0)  # range of the deviation of actions
+PRECISIONS = ("float32", "tf32", "bfloat16")  # of the networks' products while learning
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +42,8 @@ class Learner:
         steps: of each world in an iteration. hidden: widths of the layers of actor and critic.
         deviation: of the first actions. discount, trace: gamma and lambda. rate: first learning rate; target: of the
             KL divergence, to which the rate adapts. epochs, batches: of each iteration. entropy: weight of its bonus.
-        normalize: whether observations are normalised by their mean and deviation.
+        normalize: whether observations are normalised by their mean and deviation. precision: of the networks' products
+            on a GPU: "float32"; "tf32"; "bfloat16" in updates, with weights and losses in float32.
 
     Raises:
         ValueError: a setting is none; the message names it.
@@ -60,6 +62,7 @@ class Learner:
     batches: int = 4
     entropy: float = 0.01
     normalize: bool = True
+    precision: str = "tf32"
 
     def __post_init__(self) -> None:
         for name in ("iterations", "worlds", "steps", "epochs", "batches"):
@@ -77,6 +80,8 @@ class Learner:
         check_number("Learner", "entropy", self.entropy, 0.0)
         if not isinstance(self.normalize, bool):
             raise ValueError(f"Learner: normalize is {self.normalize!r}; expected True or False")
+        if self.precision not in PRECISIONS:
+            raise ValueError(f"Learner: precision is {self.precision!r}; expected one of {', '.join(PRECISIONS)}")
 
     def settings(self, env: Env, save_interval: int) -> dict[str, Any]:
         """Return the settings in rsl_rl's words.
@@ -107,6 +112,7 @@ class Learner:
                 "clip_param": 0.2, "gamma": self.discount, "lam": self.trace, "value_loss_coef": 1.0,
                 "entropy_coef": self.entropy, "learning_rate": self.rate, "max_grad_norm": 1.0, "schedule": "adaptive",
                 "desired_kl": self.target, "use_clipped_value_loss": True,
+                "use_mixed_precision": self.precision == "bfloat16",
             },
         }  # fmt: skip
 
@@ -122,8 +128,7 @@ class Gaussian(GaussianDistribution):
 def pick_device(asked: str | None) -> str:
     """Return the device to learn on: what is asked for, or this process's GPU, or "cpu".
 
-    On a CPU torch takes one thread: networks are small, and several threads wait for each other. On a GPU networks
-    multiply matrices in TF32; the dynamics do not.
+    On a CPU torch takes one thread: networks are small, and several threads wait for each other.
     """
     local = os.environ.get("LOCAL_RANK", "0")
     device = asked or (f"cuda:{local}" if torch.cuda.is_available() else "cpu")
@@ -131,8 +136,24 @@ def pick_device(asked: str | None) -> str:
         torch.set_num_threads(1)
     else:
         torch.cuda.set_device(device)
-        torch.set_float32_matmul_precision("high")
     return device
+
+
+def set_precision(precision: str, device: str) -> None:
+    """Let torch multiply matrices of float32 in TF32 or not; the dynamics never do.
+
+    Raises:
+        ValueError: the device does not multiply in bfloat16.
+    """
+    if precision == "bfloat16":
+        on_gpu = torch.device(device).type == "cuda"
+        if not on_gpu or torch.cuda.get_device_capability(device) < (8, 0):
+            name = torch.cuda.get_device_name(device) if on_gpu else "a CPU"
+            raise ValueError(
+                f"Learner: precision is 'bfloat16' on {device}, {name}; expected a GPU of compute capability 8.0 or "
+                "above, or 'float32' or 'tf32'"
+            )
+    torch.set_float32_matmul_precision("highest" if precision == "float32" else "high")
 
 
 def make_runner(
@@ -143,6 +164,7 @@ def make_runner(
     for name, value in (("save_interval", save_interval), ("every", every)):
         check_whole("train", name, value, 1)
     check_positive("train", "seconds", seconds, endless=True)
+    set_precision(learner.precision, str(env.device))
     with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints every layer of both networks
         runner = Runner(env, learner.settings(env, save_interval), str(env.device))
     began = time.time() if began is None else began
