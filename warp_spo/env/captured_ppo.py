@@ -17,7 +17,9 @@ from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from torch import nn
 
+from . import fused_update
 from .compile.cuda_graphs import Captured
+from .fused_update import FusedUpdate
 from .not_finite import NotFiniteError, find_term
 
 SLOWEST, FASTEST, FACTOR = 1e-5, 1e-2, 1.5  # learning rates, and what an adaptive one changes by, as in rsl_rl
@@ -39,12 +41,14 @@ class CapturedPPO(PPO):
     _learning: Captured
     obstacle = ""
     captures = True  # False: the same without graphs
+    fuses = False  # whether updates take few kernels of the library's own, where they can
 
     def __init__(self, *arguments: Any, **options: Any):
         super().__init__(*arguments, **options)
         self._on_gpu = torch.device(self.device).type == "cuda"
         self._refuse(find_obstacle(self))
-        kind = torch.float32 if self._on_gpu else torch.float64  # the fused Adam of a GPU reads float32
+        fuses = self.fuses and not self.obstacle and not fused_update.find_obstacle(self)
+        kind = torch.float32 if self._on_gpu or fuses else torch.float64  # the fused Adam of a GPU reads float32
         self._rate = torch.tensor(float(self.learning_rate), dtype=kind, device=self.device)
         self._kl = torch.zeros((), device=self.device)
         self._sums, self._found = (torch.zeros(n, dtype=torch.float64, device=self.device) for n in (3, 6))
@@ -54,6 +58,8 @@ class CapturedPPO(PPO):
         self._side = torch.cuda.Stream(self.device) if self._on_gpu else None
         self._seen: Any = None  # observations from which a rollout starts
         self._env: Any = None
+        self._fused: FusedUpdate | None = None
+        self._can_fuse = fuses
         self._acting: Captured | None = None
         self._kept: tuple[torch.Tensor, ...] = ()  # what was learned before this update
         self._kept_rate = 0.0
@@ -176,7 +182,9 @@ class CapturedPPO(PPO):
         """Learn from the rollout in all epochs, in the order of ``_order``."""
         self._begin()
         batches = [self._batch(index) for index in self._order]  # the same in all epochs, as in rsl_rl
-        for _ in range(self.num_learning_epochs):
+        if self._fused is not None:
+            self._fused.learn(batches)
+        for _ in range(0 if self._fused is not None else self.num_learning_epochs):
             for batch in batches:
                 self._differentiate(batch)
                 self._descend()
@@ -271,7 +279,8 @@ class CapturedPPO(PPO):
     def _summarize(self) -> None:
         """Gather all that is read of an update: mean losses, the rate, the deviation, whether all is finite."""
         steps = self.num_learning_epochs * self.num_mini_batches
-        deviation, finite = self.actor.output_std.detach().mean(), self._is_finite()
+        deviation = self.actor.output_std.detach().mean() if self._fused is None else self._fused.deviation()
+        finite = self._is_finite()
         self._found.copy_(torch.cat([self._sums / steps, torch.stack([self._rate, deviation, finite.to(self._rate)])]))
 
     # -- streams and graphs ----------------------------------------------------------------------------------------
@@ -302,6 +311,7 @@ class CapturedPPO(PPO):
             group.update(lr=self._rate, capturable=self._on_gpu, fused=self._on_gpu or None)
         for state in self.optimizer.state.values():
             state["step"] = state["step"].to(self.device)
+        self._fused = FusedUpdate(self) if self._can_fuse else None
         self._learning = self._captured(self._learn, "the update")
         batch = lambda: self._differentiate(self._batch(self._index))  # noqa: E731
         self._differentiating = self._captured(batch, "the gradient")
@@ -326,6 +336,9 @@ class CapturedPPO(PPO):
     # -- numbers that are not finite -------------------------------------------------------------------------------
     def _learned(self) -> list[torch.Tensor]:
         """Return the tensors that learning changes: networks, normalisers, the optimizer's state."""
+        if self._fused is not None:
+            models = (self._raw_actor, self._raw_critic)
+            return [*self._fused.learned(), *(x for model in models for x in model.obs_normalizer.buffers())]
         networks = [*self._raw_actor.state_dict().values(), *self._raw_critic.state_dict().values()]
         state = [value for each in self.optimizer.state.values() for value in each.values()]
         return networks + [value for value in state if isinstance(value, torch.Tensor)]

@@ -1,0 +1,235 @@
+"""Updates of PPO in few kernels: products of matrices by torch, all else fused: :class:`FusedUpdate`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+import warp as wp
+from rsl_rl.modules.distribution import GaussianDistribution
+from torch import nn
+
+from ..kernels import policy_updates as kernels
+from ..runtime.launches import launch
+from ..runtime.torch_tensors import stream
+
+ALIGNED = 64  # weights from one array to the next: products read and write whole lines of memory
+
+
+class FusedBatch(NamedTuple):
+    """A minibatch [sample, number]: inputs of both networks, and what the rollout has of its samples."""
+
+    actor: torch.Tensor
+    critic: torch.Tensor
+    actions: torch.Tensor
+    old_mean: torch.Tensor
+    old_deviation: torch.Tensor
+    old_log_prob: torch.Tensor
+    advantages: torch.Tensor
+    values: torch.Tensor
+    returns: torch.Tensor
+
+
+class FusedNetwork:
+    """Layers of ELU and a last one without, whose results and gradients have their places.
+
+    Args:
+        layers: linear ones. weights, gradients: of all arrays of the update, by parameter; weights as products read
+            them. rows: samples of a minibatch. dtype: of products.
+    """
+
+    def __init__(self, layers: Sequence[nn.Linear], weights: Any, gradients: Any, rows: int, dtype: torch.dtype):
+        device = layers[0].weight.device
+        self.device = str(wp.device_from_torch(device))
+        self.layers = list(layers)
+        self.weights = [weights[layer.weight] for layer in layers]
+        self.gradients = [gradients[layer.weight] for layer in layers]
+        self.bias_gradients = [gradients[layer.bias] for layer in layers]
+        self.results, self.slopes = (
+            [torch.empty(rows, layer.out_features, dtype=dtype, device=device) for layer in layers] for _ in range(2)
+        )
+        parts = -(-rows // kernels.CHUNK)
+        self.sums = [torch.empty(parts, layer.out_features, device=device) for layer in layers[:-1]]
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the last layer's results without its bias [sample, number]."""
+        for layer, weight, result in zip(self.layers, self.weights, self.results, strict=True):
+            torch.mm(x, weight.t(), out=result)
+            if layer is not self.layers[-1]:
+                threads = -(-len(x) // 4), layer.out_features
+                start(kernels.add_bias_and_elu, threads, [result, layer.bias.detach()], self.device)
+            x = result
+        return x
+
+    def backward(self, x: torch.Tensor) -> None:
+        """Compute the gradients of weights from that of the last results, ``slopes[-1]``."""
+        for i in reversed(range(len(self.layers))):
+            slope = self.slopes[i]
+            multiply(slope.t(), self.results[i - 1] if i else x, self.gradients[i])
+            if i:
+                below, sums = self.slopes[i - 1], self.sums[i - 1]
+                torch.mm(slope, self.weights[i], out=below)
+                start(kernels.differentiate_elu, sums.shape, [self.results[i - 1], below, sums], self.device)
+                torch.sum(sums, dim=0, out=self.bias_gradients[i - 1])
+
+
+class FusedUpdate:
+    """An update of actor and critic that are layers of ELU, with a Gaussian policy and Adam.
+
+    Weights, gradients and Adam's averages of both networks lie in four arrays, of which parameters and the optimizer's
+    state are views. Actor and critic run on two streams up to Adam's step, which is one kernel.
+
+    Args:
+        alg: whose networks learn; :func:`find_obstacle` says whether they can.
+    """
+
+    def __init__(self, alg: Any):
+        self.alg = alg
+        device = torch.device(alg.device)
+        self.device = str(wp.device_from_torch(device))
+        self.dtype = torch.bfloat16 if alg.use_mixed_precision else torch.float32
+        parameters = [[*model.parameters()] for model in (alg._raw_actor, alg._raw_critic)]
+        starts, end = [], 0
+        for each in parameters:
+            for weight in each:
+                starts.append(end)
+                end += -(-weight.numel() // ALIGNED) * ALIGNED
+        self.border = starts[len(parameters[0])]
+        flat = [torch.zeros(end, device=device) for _ in range(4)]
+        self.weights, self.gradients, self.first, self.second = flat
+        self.rate = alg._rate.view(1)
+        self.copies = torch.zeros(end if self.dtype != torch.float32 else 0, dtype=self.dtype, device=device)
+        views: list[dict[Any, torch.Tensor]] = [{}, {}]
+        self.steps = torch.zeros((), device=device)
+        for weight, begin in zip([*parameters[0], *parameters[1]], starts, strict=True):
+            own = [each[begin : begin + weight.numel()].view_as(weight) for each in flat]
+            own[0].copy_(weight.detach())
+            state = alg.optimizer.state.get(weight, {})
+            for name, place in zip(("exp_avg", "exp_avg_sq"), own[2:], strict=True):
+                if state:
+                    place.copy_(state[name])
+            if state:
+                self.steps.copy_(state["step"])
+            alg.optimizer.state[weight] = {"step": self.steps, "exp_avg": own[2], "exp_avg_sq": own[3]}
+            weight.data = own[0]
+            views[1][weight] = own[1]
+            views[0][weight] = (
+                self.copies[begin : begin + weight.numel()].view_as(weight) if len(self.copies) else own[0]
+            )
+        self.copies.copy_(self.weights[: len(self.copies)])
+        self.group = alg.optimizer.param_groups[0]
+        self.deviations = alg._raw_actor.distribution.std_param.detach()
+        self.deviation_gradient = views[1][alg._raw_actor.distribution.std_param]
+        rows = alg._order.shape[1]
+        self.actor, self.critic = (
+            FusedNetwork([x for x in model.mlp if isinstance(x, nn.Linear)], *views, rows, self.dtype)
+            for model in (alg._raw_actor, alg._raw_critic)
+        )
+        actions, count = len(self.deviations), alg.num_learning_epochs * alg.num_mini_batches
+        self.terms = torch.empty(rows, 2 * actions + 2, device=device)
+        self.value_terms = torch.empty(rows, 2, device=device)
+        self.sums = torch.zeros(count, 2 * actions + 2, device=device)
+        self.value_sums, self.entropies = torch.zeros(count, 2, device=device), torch.zeros(count, device=device)
+        self.norms, self.corrections = torch.zeros(2, device=device), torch.zeros(2, device=device)
+
+    def learned(self) -> list[torch.Tensor]:
+        """Return the tensors that steps change."""
+        return [self.weights, self.first, self.second, self.steps]
+
+    def deviation(self) -> torch.Tensor:
+        """Return the mean deviation of actions."""
+        return self.deviations.clamp(*self.alg._raw_actor.distribution.std_range).mean()
+
+    def batch(self, held: Any) -> FusedBatch:
+        """Return a minibatch of rsl_rl with the inputs of both networks."""
+        alg = self.alg
+        actor, critic = (model.get_latent(held.observations).to(self.dtype) for model in (alg.actor, alg.critic))
+        return FusedBatch(
+            actor, critic, held.actions, *held.old_distribution_params, held.old_actions_log_prob, held.advantages,
+            held.values, held.returns,
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def learn(self, held: Sequence[Any]) -> None:
+        """Take all steps of an update, and leave the sums of losses."""
+        alg = self.alg
+        batches = [self.batch(each) for each in held]
+        if len(self.copies):
+            self.copies.copy_(self.weights)
+        for k in range(len(self.entropies)):
+            batch = batches[k % len(batches)]
+            with alg._beside():
+                self._differentiate_critic(batch, k)
+            self._differentiate_actor(batch, k)
+            alg._join()
+            beta1, beta2 = self.group["betas"]
+            numbers = [self.weights, self.gradients, self.first, self.second, self.copies, self.border, self.norms,
+                       alg.max_grad_norm, beta1, beta2, self.group["eps"], self.rate, self.corrections]  # fmt: skip
+            start(kernels.clip_and_step, len(self.weights), numbers, self.device)
+        size = len(self.deviations)
+        losses = [self.value_sums[:, 1].sum(), self.sums[:, 2 * size].sum(), self.entropies.sum()]
+        alg._sums.copy_(torch.stack(losses))
+
+    def _differentiate_critic(self, batch: FusedBatch, k: int) -> None:
+        alg, net = self.alg, self.critic
+        last = net.layers[-1].bias.detach()
+        values = net.forward(batch.critic)
+        numbers = [values, last, batch.values, batch.returns, alg.clip_param, alg.use_clipped_value_loss,
+                   alg.value_loss_coef, net.slopes[-1], self.value_terms]  # fmt: skip
+        start(kernels.value_loss, len(values), numbers, self.device)
+        torch.sum(self.value_terms, dim=0, out=self.value_sums[k])
+        net.bias_gradients[-1].copy_(self.value_sums[k, :1])
+        net.backward(batch.critic)
+        torch.linalg.vector_norm(self.gradients[self.border :], out=self.norms[1])
+
+    def _differentiate_actor(self, batch: FusedBatch, k: int) -> None:
+        alg, net = self.alg, self.actor
+        last = net.layers[-1].bias.detach()
+        limits = alg._raw_actor.distribution.std_range
+        means = net.forward(batch.actor)
+        numbers = [means, last, self.deviations, *limits, batch.actions, batch.old_mean, batch.old_deviation,
+                   batch.old_log_prob, batch.advantages, alg.clip_param, net.slopes[-1], self.terms]  # fmt: skip
+        start(kernels.surrogate_loss, len(means), numbers, self.device)
+        torch.sum(self.terms, dim=0, out=self.sums[k])
+        numbers = [self.sums[k], self.deviations, *limits, alg.entropy_coef, alg.desired_kl if alg._adapts else 0.0,
+                   *self.group["betas"], self.deviation_gradient, net.bias_gradients[-1], self.rate,
+                   self.steps.view(1), self.corrections, self.entropies[k : k + 1]]  # fmt: skip
+        start(kernels.adapt, len(self.deviations), numbers, self.device)
+        net.backward(batch.actor)
+        torch.linalg.vector_norm(self.gradients[: self.border], out=self.norms[0])
+
+
+def find_obstacle(alg: Any) -> str:
+    """Return why the updates of an algorithm are not fused, "" where they can be."""
+    spread = alg._raw_actor.distribution
+    if not isinstance(spread, GaussianDistribution) or not hasattr(spread, "std_param"):
+        return "the policy is no Gaussian with deviations of its own"
+    for model in (alg._raw_actor, alg._raw_critic):
+        layers = list(model.mlp)
+        expected = [nn.Linear, nn.ELU] * (len(layers) // 2) + [nn.Linear]
+        if [type(x) for x in layers] != expected or any(x.alpha != 1.0 for x in layers[1::2]):
+            return "a network has other layers than linear ones and ELU"
+    group = alg.optimizer.param_groups[0]
+    if type(alg.optimizer) is not torch.optim.Adam or group["weight_decay"] or group["amsgrad"]:
+        return "the optimizer is not Adam without decay"
+    if alg.is_multi_gpu or alg.normalize_advantage_per_mini_batch:
+        return "several processes learn" if alg.is_multi_gpu else "advantages are normalised for each minibatch"
+    return ""
+
+
+def start(kernel: Any, dim: Any, numbers: Sequence[Any], device: str) -> None:
+    """Launch a kernel on torch's current stream; tensors may be among its arguments."""
+    arguments = [wp.from_torch(x, requires_grad=False) if isinstance(x, torch.Tensor) else x for x in numbers]
+    held = wp.get_device(device)
+    scope = wp.ScopedStream(stream(held), sync_enter=False) if held.is_cuda else wp.ScopedDevice(held)
+    with scope:
+        launch(kernel, dim if isinstance(dim, int) else tuple(dim), arguments, [], device=held)
+
+
+def multiply(a: torch.Tensor, b: torch.Tensor, out: torch.Tensor) -> None:
+    """Set ``out``, float32, to the product of matrices."""
+    if a.dtype == out.dtype:
+        torch.mm(a, b, out=out)
+    else:
+        out.copy_(torch.mm(a, b))
