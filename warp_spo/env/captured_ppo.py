@@ -21,6 +21,7 @@ from . import fused_update
 from .compile.cuda_graphs import Captured
 from .fused_update import FusedUpdate
 from .not_finite import NotFiniteError, find_term
+from .startup import plain_step
 
 SLOWEST, FASTEST, FACTOR = 1e-5, 1e-2, 1.5  # learning rates, and what an adaptive one changes by, as in rsl_rl
 ACTED = ("actions", "values", "actions_log_prob", "distribution_params", "hidden_states")  # what acting leaves
@@ -261,6 +262,7 @@ class CapturedPPO(PPO):
         with torch.amp.autocast(kind, torch.bfloat16, enabled=self.use_mixed_precision):
             return model.mlp(model.get_latent(observations)).float()
 
+    @torch.no_grad()
     def _descend(self) -> None:
         """Take a step of the optimizer along the gradients, by a rate that the KL divergence may have changed."""
         if self._adapts:
@@ -270,7 +272,7 @@ class CapturedPPO(PPO):
             rate.copy_(torch.where(kl > self.desired_kl * 2.0, slower, grown))
         for model in (self.actor, self.critic):
             nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
-        self.optimizer.step()
+        self._step()
 
     @property
     def _adapts(self) -> bool:
@@ -311,6 +313,7 @@ class CapturedPPO(PPO):
             group.update(lr=self._rate, capturable=self._on_gpu, fused=self._on_gpu or None)
         for state in self.optimizer.state.values():
             state["step"] = state["step"].to(self.device)
+        self._step = plain_step(self.optimizer)
         self._fused = FusedUpdate(self) if self._can_fuse else None
         self._learning = self._captured(self._learn, "the update")
         batch = lambda: self._differentiate(self._batch(self._index))  # noqa: E731

@@ -26,11 +26,11 @@ from .captured_ppo import CapturedPPO
 from .environment import Env
 from .loggers import checked
 from .runner import Runner, describe_end, load_checkpoint, run
+from .startup import PRECISIONS
 from .training_log import TrainingLog
 from .validation import check_folder, check_number, check_positive, check_whole
 
 DEVIATIONS = (0.05, 2.0)  # range of the deviation of actions
-PRECISIONS = ("float32", "tf32", "bfloat16")  # of the networks' products while learning
 
 
 @dataclasses.dataclass(frozen=True)
