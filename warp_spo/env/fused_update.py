@@ -120,6 +120,7 @@ class FusedUpdate:
         self.copies.copy_(self.weights[: len(self.copies)])
         self.group = alg.optimizer.param_groups[0]
         self.deviations = alg._raw_actor.distribution.std_param.detach()
+        self.gradient_of = views[1]
         self.deviation_gradient = views[1][alg._raw_actor.distribution.std_param]
         rows = alg._order.shape[1]
         self.actor, self.critic = (
