@@ -36,19 +36,21 @@ class CapturedPPO(PPO):
 
     Attributes:
         obstacle: why it learns as in rsl_rl; "" where it does not. deviation: mean deviation of actions.
+        log: what ``env.log()`` said after the rollout.
     """
 
     learning_rate: float
     _learning: Captured
     obstacle = ""
     captures = True  # False: the same without graphs
-    fuses = False  # whether updates take few kernels of the library's own, where they can
+    fuses: bool | None = None  # whether updates take few kernels, :class:`FusedUpdate`; None: on CUDA, where they can
 
     def __init__(self, *arguments: Any, **options: Any):
         super().__init__(*arguments, **options)
         self._on_gpu = torch.device(self.device).type == "cuda"
         self._refuse(find_obstacle(self))
-        fuses = self.fuses and not self.obstacle and not fused_update.find_obstacle(self)
+        fuses = self._on_gpu if self.fuses is None else self.fuses
+        fuses = fuses and not self.obstacle and not fused_update.find_obstacle(self)
         kind = torch.float32 if self._on_gpu or fuses else torch.float64  # the fused Adam of a GPU reads float32
         self._rate = torch.tensor(float(self.learning_rate), dtype=kind, device=self.device)
         self._kl = torch.zeros((), device=self.device)
@@ -59,12 +61,14 @@ class CapturedPPO(PPO):
         self._side = torch.cuda.Stream(self.device) if self._on_gpu else None
         self._seen: Any = None  # observations from which a rollout starts
         self._env: Any = None
+        self._log_names: list[str] = []
         self._fused: FusedUpdate | None = None
         self._can_fuse = fuses
         self._acting: Captured | None = None
         self._kept: tuple[torch.Tensor, ...] = ()  # what was learned before this update
         self._kept_rate = 0.0
         self.deviation = torch.zeros(())
+        self.log, self._log_values = dict[str, float](), torch.zeros(0, device=self.device)
         self._adopt()
 
     def compile(self, mode: str | None = None) -> None:
@@ -109,6 +113,10 @@ class CapturedPPO(PPO):
             self.process_env_step(obs, rewards, dones, extras)
         self.compute_returns(obs)
         copy_into(self._seen, obs)
+        found = self._env.log() if hasattr(self._env, "log") else {}
+        self._log_names = list(found)
+        if found:
+            self._log_values = torch.stack([value.float() for value in found.values()])
 
     def act(self, obs: Any) -> torch.Tensor:
         """Sample actions and keep what the storage needs; on CUDA by a graph, outside of that of a rollout."""
@@ -171,7 +179,10 @@ class CapturedPPO(PPO):
             else:
                 self._learning()
             self.storage.clear()
-            *means, rate, deviation, finite = self._found.tolist()
+            size = len(self._found)
+            numbers = torch.cat([self._found, self._log_values]).tolist()  # the one wait for the device
+            *means, rate, deviation, finite = numbers[:size]
+            self.log = dict(zip(self._log_names, numbers[size:], strict=True))
             self.learning_rate, self.deviation = rate, torch.tensor(deviation)
             losses = dict(zip(("value", "surrogate", "entropy"), means, strict=True))
         if not finite:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from ..runtime.launches import launch
 from ..runtime.torch_tensors import stream
 
 ALIGNED = 64  # weights from one array to the next: products read and write whole lines of memory
+WIDE = 8  # entries that products read at once: rows of inputs and of the first weights are filled up with zeros
 
 
 class FusedBatch(NamedTuple):
@@ -35,8 +37,8 @@ class FusedNetwork:
     """Layers of ELU and a last one without, whose results and gradients have their places.
 
     Args:
-        layers: linear ones. weights, gradients: of all arrays of the update, by parameter; weights as products read
-            them. rows: samples of a minibatch. dtype: of products.
+        layers: linear ones. weights, gradients: of all parameters, as products read and write them. rows: samples of a
+            minibatch. dtype: of products.
     """
 
     def __init__(self, layers: Sequence[nn.Linear], weights: Any, gradients: Any, rows: int, dtype: torch.dtype):
@@ -51,6 +53,7 @@ class FusedNetwork:
         )
         parts = -(-rows // kernels.CHUNK)
         self.sums = [torch.empty(parts, layer.out_features, device=device) for layer in layers[:-1]]
+        self.ones = torch.ones(parts, device=device)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the last layer's results without its bias [sample, number]."""
@@ -71,7 +74,7 @@ class FusedNetwork:
                 below, sums = self.slopes[i - 1], self.sums[i - 1]
                 torch.mm(slope, self.weights[i], out=below)
                 start(kernels.differentiate_elu, sums.shape, [self.results[i - 1], below, sums], self.device)
-                torch.sum(sums, dim=0, out=self.bias_gradients[i - 1])
+                torch.mv(sums.t(), self.ones, out=self.bias_gradients[i - 1])
 
 
 class FusedUpdate:
@@ -89,42 +92,45 @@ class FusedUpdate:
         device = torch.device(alg.device)
         self.device = str(wp.device_from_torch(device))
         self.dtype = torch.bfloat16 if alg.use_mixed_precision else torch.float32
-        parameters = [[*model.parameters()] for model in (alg._raw_actor, alg._raw_critic)]
-        starts, end = [], 0
-        for each in parameters:
-            for weight in each:
-                starts.append(end)
-                end += -(-weight.numel() // ALIGNED) * ALIGNED
-        self.border = starts[len(parameters[0])]
+        models = alg._raw_actor, alg._raw_critic
+        parameters = [weight for model in models for weight in model.parameters()]
+        shapes = [tuple(weight.shape) for weight in parameters]
+        for i, weight in enumerate(parameters):
+            if any(weight is model.mlp[0].weight for model in models):
+                shapes[i] = len(weight), padded(weight.shape[1], WIDE)
+        sizes = [padded(math.prod(shape), ALIGNED) for shape in shapes]
+        self.border, end = sum(sizes[: len([*models[0].parameters()])]), sum(sizes)
         flat = [torch.zeros(end, device=device) for _ in range(4)]
         self.weights, self.gradients, self.first, self.second = flat
         self.rate = alg._rate.view(1)
         self.copies = torch.zeros(end if self.dtype != torch.float32 else 0, dtype=self.dtype, device=device)
-        views: list[dict[Any, torch.Tensor]] = [{}, {}]
         self.steps = torch.zeros((), device=device)
-        for weight, begin in zip([*parameters[0], *parameters[1]], starts, strict=True):
-            own = [each[begin : begin + weight.numel()].view_as(weight) for each in flat]
+        self.gradient_of: dict[Any, torch.Tensor] = {}
+        factors, slopes = dict[Any, torch.Tensor](), dict[Any, torch.Tensor]()
+        begin = 0
+        for weight, shape, size in zip(parameters, shapes, sizes, strict=True):
+            parts = [each[begin : begin + math.prod(shape)].view(shape) for each in (*flat, self.copies) if len(each)]
+            own = [part[:, : weight.shape[1]] if weight.ndim == 2 else part for part in parts]
+            state = alg.optimizer.state.get(weight)
             own[0].copy_(weight.detach())
-            state = alg.optimizer.state.get(weight, {})
-            for name, place in zip(("exp_avg", "exp_avg_sq"), own[2:], strict=True):
-                if state:
-                    place.copy_(state[name])
             if state:
+                own[2].copy_(state["exp_avg"])
+                own[3].copy_(state["exp_avg_sq"])
                 self.steps.copy_(state["step"])
             alg.optimizer.state[weight] = {"step": self.steps, "exp_avg": own[2], "exp_avg_sq": own[3]}
             weight.data = own[0]
-            views[1][weight] = own[1]
-            views[0][weight] = (
-                self.copies[begin : begin + weight.numel()].view_as(weight) if len(self.copies) else own[0]
+            factors[weight], slopes[weight], self.gradient_of[weight] = (
+                parts[4 if len(parts) > 4 else 0],
+                parts[1],
+                own[1],
             )
-        self.copies.copy_(self.weights[: len(self.copies)])
+            begin += size
         self.group = alg.optimizer.param_groups[0]
         self.deviations = alg._raw_actor.distribution.std_param.detach()
-        self.gradient_of = views[1]
-        self.deviation_gradient = views[1][alg._raw_actor.distribution.std_param]
+        self.deviation_gradient = self.gradient_of[alg._raw_actor.distribution.std_param]
         rows = alg._order.shape[1]
         self.actor, self.critic = (
-            FusedNetwork([x for x in model.mlp if isinstance(x, nn.Linear)], *views, rows, self.dtype)
+            FusedNetwork([x for x in model.mlp if isinstance(x, nn.Linear)], factors, slopes, rows, self.dtype)
             for model in (alg._raw_actor, alg._raw_critic)
         )
         actions, count = len(self.deviations), alg.num_learning_epochs * alg.num_mini_batches
@@ -145,11 +151,16 @@ class FusedUpdate:
     def batch(self, held: Any) -> FusedBatch:
         """Return a minibatch of rsl_rl with the inputs of both networks."""
         alg = self.alg
-        actor, critic = (model.get_latent(held.observations).to(self.dtype) for model in (alg.actor, alg.critic))
+        actor, critic = (self._inputs(model.get_latent(held.observations)) for model in (alg.actor, alg.critic))
         return FusedBatch(
             actor, critic, held.actions, *held.old_distribution_params, held.old_actions_log_prob, held.advantages,
             held.values, held.returns,
         )  # fmt: skip
+
+    def _inputs(self, latent: torch.Tensor) -> torch.Tensor:
+        """Return inputs of a network in the dtype of products, filled up with zeros."""
+        count = latent.shape[1]
+        return nn.functional.pad(latent.to(self.dtype), (0, padded(count, WIDE) - count))
 
     @torch.no_grad()
     def learn(self, held: Sequence[Any]) -> None:
@@ -217,6 +228,11 @@ def find_obstacle(alg: Any) -> str:
     if alg.is_multi_gpu or alg.normalize_advantage_per_mini_batch:
         return "several processes learn" if alg.is_multi_gpu else "advantages are normalised for each minibatch"
     return ""
+
+
+def padded(count: int, size: int) -> int:
+    """Return the next multiple of a size."""
+    return -(-count // size) * size
 
 
 def start(kernel: Any, dim: Any, numbers: Sequence[Any], device: str) -> None:

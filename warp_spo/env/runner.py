@@ -27,6 +27,22 @@ class TrainingStopped(Exception):
     """A signal came, or the time that a training may take is over."""
 
 
+class Instant:
+    """A moment of the work on a device; a difference of two are seconds."""
+
+    def __init__(self, device: Any):
+        self.event = torch.cuda.Event(enable_timing=True) if torch.device(device).type == "cuda" else None
+        self.seconds = time.perf_counter()
+        if self.event is not None:
+            self.event.record()
+
+    def __sub__(self, before: Instant) -> float:
+        if self.event is None or before.event is None:
+            return self.seconds - before.seconds
+        self.event.synchronize()
+        return 1e-3 * before.event.elapsed_time(self.event)
+
+
 class Ending(NamedTuple):
     """How a training ended.
 
@@ -79,16 +95,16 @@ class Runner(OnPolicyRunner):
         self.logger.init_logging_writer()
         first = self.current_learning_iteration
         for iteration in range(first, first + num_learning_iterations):
-            began = time.time()
+            began = Instant(self.device)
             obs = alg.collect(self.env, obs)
-            wait(self.device)
-            collected = time.time()
+            collected = Instant(self.device)
             losses = alg.update()
+            learned = Instant(self.device)
             self.current_learning_iteration = iteration
             self.logger.log(
-                it=iteration, start_it=first, total_it=first + num_learning_iterations, collect_time=collected - began,
-                learn_time=time.time() - collected, loss_dict=losses, learning_rate=alg.learning_rate,
-                action_std=alg.deviation, rnd_weight=None,
+                it=iteration, start_it=first, total_it=first + num_learning_iterations,
+                collect_time=collected - began, learn_time=learned - collected, loss_dict=losses,
+                learning_rate=alg.learning_rate, action_std=alg.deviation, rnd_weight=None, env_log=alg.log,
             )  # fmt: skip
 
     def save(self, path: str, infos: dict | None = None) -> None:
@@ -282,12 +298,6 @@ def describe_end(ending: Ending) -> str:
     words += [f"stopped by {ending.fault}"] if ending.fault else []
     words += [f"not written: {', '.join(ending.unwritten)}"] if ending.unwritten else []
     return "; ".join(words)
-
-
-def wait(device: Any) -> None:
-    """Wait for a GPU, so that times are those of the work; a CPU is never behind."""
-    if torch.device(device).type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def _on_host(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:

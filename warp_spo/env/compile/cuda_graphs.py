@@ -71,9 +71,12 @@ class Captured:
         try:  # NCCL and others have threads of their own, which may do as they like
             with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
                 self._function()
-        except RuntimeError as error:
-            warnings.warn(f"{self._what} runs without a CUDA graph: {str(error).splitlines()[0]}", stacklevel=3)
+        except Exception as error:
+            why = f"{error or type(error).__name__}".splitlines()[0]
+            warnings.warn(f"{self._what} runs without a CUDA graph: {why}", stacklevel=3)
             torch.cuda.synchronize()
+            with torch.cuda.graph(torch.cuda.CUDAGraph(), stream=stream):  # else torch takes later draws for captured
+                torch.zeros(1, device=stream.device)
             return False
         self._graph = graph
         return True
