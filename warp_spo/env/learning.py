@@ -139,20 +139,21 @@ def pick_device(asked: str | None) -> str:
     return device
 
 
-def set_precision(precision: str, device: str) -> None:
-    """Let torch multiply matrices of float32 in TF32 or not; the dynamics never do.
+def check_precision(precision: str, device: str) -> None:
+    """Raise ValueError where a device cannot learn by a precision."""
+    if precision != "bfloat16":
+        return
+    on_gpu = torch.device(device).type == "cuda"
+    if not on_gpu or torch.cuda.get_device_capability(device) < (8, 0):
+        name = torch.cuda.get_device_name(device) if on_gpu else "a CPU"
+        raise ValueError(
+            f"Learner: precision is 'bfloat16' on {device}, {name}; expected a GPU of compute capability 8.0 or above, "
+            "or 'float32' or 'tf32'"
+        )
 
-    Raises:
-        ValueError: the device does not multiply in bfloat16.
-    """
-    if precision == "bfloat16":
-        on_gpu = torch.device(device).type == "cuda"
-        if not on_gpu or torch.cuda.get_device_capability(device) < (8, 0):
-            name = torch.cuda.get_device_name(device) if on_gpu else "a CPU"
-            raise ValueError(
-                f"Learner: precision is 'bfloat16' on {device}, {name}; expected a GPU of compute capability 8.0 or "
-                "above, or 'float32' or 'tf32'"
-            )
+
+def set_precision(precision: str) -> None:
+    """Let torch multiply matrices of float32 in TF32 or not; the dynamics never do."""
     torch.set_float32_matmul_precision("highest" if precision == "float32" else "high")
 
 
@@ -164,7 +165,7 @@ def make_runner(
     for name, value in (("save_interval", save_interval), ("every", every)):
         check_whole("train", name, value, 1)
     check_positive("train", "seconds", seconds, endless=True)
-    set_precision(learner.precision, str(env.device))
+    set_precision(learner.precision)
     with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints every layer of both networks
         runner = Runner(env, learner.settings(env, save_interval), str(env.device))
     began = time.time() if began is None else began
@@ -183,6 +184,7 @@ def prepare(
 ) -> tuple[Runner, int]:  # fmt: skip
     """Return a runner that is ready to train, and how many iterations are left; see :func:`train`."""
     check_folder(folder, resume)
+    check_precision(learner.precision, str(env.device))
     if iterations is not None:
         check_whole("train", "iterations", iterations, 1)
     torch.manual_seed(check_whole("train", "seed", seed, 0, 2**64 - 1))
