@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import warnings
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import torch
@@ -31,8 +34,9 @@ class CapturedPPO(PPO):
     """rsl_rl's PPO. On CUDA a rollout is one graph and an update another; on a CPU the same code is called.
 
     An update reads the device once. The learning rate lives on the device, where an adaptive one follows the KL
-    divergence. Actor and critic run on two streams. With several processes an update has two graphs for a minibatch,
-    between which gradients are averaged. What cannot be captured learns as in rsl_rl, and a warning says why.
+    divergence. Actor and critic run on two streams, or on a CPU in two threads. With several processes an update has
+    two graphs for a minibatch, between which gradients are averaged. What cannot be captured learns as in rsl_rl, and a
+    warning says why.
 
     Attributes:
         obstacle: why it learns as in rsl_rl; "" where it does not. deviation: mean deviation of actions.
@@ -59,12 +63,15 @@ class CapturedPPO(PPO):
         self._order = torch.zeros(self.num_mini_batches, size, dtype=torch.int64, device=self.device)
         self._index = self._order[0].clone()
         self._side = torch.cuda.Stream(self.device) if self._on_gpu else None
+        threads = not self._on_gpu and not self.is_multi_gpu and len(os.sched_getaffinity(0)) > 1
+        self._helper = ThreadPoolExecutor(1, "critic") if threads else None
         self._seen: Any = None  # observations from which a rollout starts
         self._env: Any = None
         self._log_names: list[str] = []
         self._fused: FusedUpdate | None = None
         self._can_fuse = fuses
         self._acting: Captured | None = None
+        self._values: Callable[[], torch.Tensor] | None = None  # waits for those of the last actions
         self._kept: tuple[torch.Tensor, ...] = ()  # what was learned before this update
         self._kept_rate = 0.0
         self.deviation = torch.zeros(())
@@ -120,8 +127,10 @@ class CapturedPPO(PPO):
 
     def act(self, obs: Any) -> torch.Tensor:
         """Sample actions and keep what the storage needs; on CUDA by a graph, outside of that of a rollout."""
-        if self.obstacle or not self._on_gpu or torch.cuda.is_current_stream_capturing():
-            return super().act(obs) if self.obstacle else self._act(obs)
+        if self.obstacle:
+            return super().act(obs)
+        if not self._on_gpu or torch.cuda.is_current_stream_capturing():
+            return self._act(obs)
         if self._acting is None:
             self._acted_on = obs.clone()
             self._acting = self._captured(self._act_for_graph, "the policy")
@@ -129,29 +138,31 @@ class CapturedPPO(PPO):
         self._acting()
         for name, value in self._acted.items():
             setattr(self.transition, name, value)
+        self._values = None
         self.transition.observations = obs
         return self.transition.actions  # type: ignore[return-value]
 
     def _act_for_graph(self) -> None:
         self._act(self._acted_on)
-        self._join()
+        self.transition.values = self._values()
         self._acted = {name: getattr(self.transition, name) for name in ACTED}
 
     def _act(self, obs: Any) -> torch.Tensor:
         """Sample actions as ``PPO.act`` does; values come on the other stream, for which ``process_env_step`` waits."""
         kept = self.transition
         kept.hidden_states = (None, None)
-        with self._beside():
-            kept.values = self.critic(obs).detach()
+        values = self._start_beside(torch.inference_mode()(lambda: self.critic(obs).detach()))
         kept.actions = self.actor(obs, stochastic_output=True).detach()
         kept.actions_log_prob = self.actor.get_output_log_prob(kept.actions).detach()
         kept.distribution_params = tuple(each.detach() for each in self.actor.output_distribution_params)
         kept.observations = obs
+        self._values = values
         return kept.actions
 
     def process_env_step(self, obs: Any, rewards: Any, dones: Any, extras: Any) -> None:
         """Store a step, as in rsl_rl."""
-        self._join()
+        if self._values is not None:
+            self.transition.values, self._values = self._values(), None
         super().process_env_step(obs, rewards, dones, extras)
 
     def compute_returns(self, obs: Any) -> None:
@@ -239,8 +250,8 @@ class CapturedPPO(PPO):
 
     def _differentiate(self, batch: Any) -> None:
         """Compute the losses of a minibatch, their gradients, and the KL divergence."""
-        with self._beside():
-            value = self._value_loss(batch)
+        self.optimizer.zero_grad()
+        critic = self._start_beside(lambda: self._differentiate_critic(batch))
         actor, advantages = self.actor, torch.squeeze(batch.advantages)
         if self.normalize_advantage_per_mini_batch:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
@@ -254,18 +265,19 @@ class CapturedPPO(PPO):
         clipped = torch.clamp(ratio, 1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate = torch.max(-advantages * ratio, -advantages * clipped).mean()
         entropy = actor.output_entropy.mean()
-        self._join()
-        self.optimizer.zero_grad()
-        (surrogate + self.value_loss_coef * value - self.entropy_coef * entropy).backward()
-        self._sums += torch.stack([value, surrogate, entropy]).detach()
+        (surrogate - self.entropy_coef * entropy).backward()
+        self._sums += torch.stack([critic(), surrogate, entropy]).detach()
 
-    def _value_loss(self, batch: Any) -> torch.Tensor:
+    def _differentiate_critic(self, batch: Any) -> torch.Tensor:
+        """Compute the gradients of the value loss, and return it."""
         values = self._outputs(self.critic, batch.observations)
         losses = (values - batch.returns).pow(2)
         if self.use_clipped_value_loss:
             near = batch.values + (values - batch.values).clamp(-self.clip_param, self.clip_param)
             losses = torch.max(losses, (near - batch.returns).pow(2))
-        return losses.mean()
+        value = losses.mean()
+        (self.value_loss_coef * value).backward()
+        return value
 
     def _outputs(self, model: MLPModel, observations: Any) -> torch.Tensor:
         """Return what a network makes of observations, without a sample that nobody reads."""
@@ -297,6 +309,19 @@ class CapturedPPO(PPO):
         self._found.copy_(torch.cat([self._sums / steps, torch.stack([self._rate, deviation, finite.to(self._rate)])]))
 
     # -- streams and graphs ----------------------------------------------------------------------------------------
+    def _start_beside(self, work: Callable[[], torch.Tensor]) -> Callable[[], torch.Tensor]:
+        """Do work on the other stream, or on a CPU in the other thread; return a function that waits for its result."""
+        if self._helper is not None:
+            return self._helper.submit(work).result
+        with self._beside():
+            found = work()
+
+        def wait() -> torch.Tensor:
+            self._join()
+            return found
+
+        return wait
+
     def _beside(self) -> Any:
         """Return a context in which work goes to the other stream, after what the current one has."""
         if self._side is None:
