@@ -25,6 +25,7 @@ import sys
 import tempfile
 import time
 import traceback
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ from rsl_rl.runners import OnPolicyRunner
 from warp_spo import env as envs
 from warp_spo.env import learning
 from warp_spo.env.captured_ppo import CapturedPPO
+from warp_spo.env.compile.cuda_graphs import Captured
 from warp_spo.env.startup import PRECISIONS
 from warp_spo.env.tasks import task
 from warp_spo.env.training_log import read_rows
@@ -243,6 +245,9 @@ def train(device: str, precision: str, every: int = 20) -> dict[str, Any]:
         found: dict[str, Any] = {"wall": wall, "start": [line.strip() for line in lines if " s  " in line[:14]]}
         if done.returncode:
             return found | {"error": done.stderr[-2000:]}
+        again = [*command[:-1], f"{folder}/again", "--iterations", "1"]
+        warm = subprocess.run(again, env=own, capture_output=True, text=True)
+        found["start, warm"] = [line.strip() for line in warm.stdout.splitlines() if " s  " in line[:14]]
         rows = read_rows(Path(folder) / "run" / "progress.jsonl")
         found["reward of the last 20"] = statistics.mean(row["reward"] for row in rows[-20:])
         found["warnings"] = [line for line in done.stderr.splitlines() if "Warning: train" in line]
@@ -257,6 +262,23 @@ def train(device: str, precision: str, every: int = 20) -> dict[str, Any]:
             if all(errors[name] <= limit for name, limit in ASKED.items()):
                 return found | {"seconds to walk": rows[iteration]["seconds"]}
         return found
+
+
+def recover(device: str) -> dict[str, Any]:
+    """Return whether a function that cannot be captured is called instead, and random numbers can be drawn after it."""
+    numbers = torch.zeros(1, device=device)
+
+    def wait() -> None:
+        numbers.add_(torch.randn(1, device=device))
+        numbers.item()
+
+    work = Captured(wait, device, "a function that waits", plain=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        work()
+        work()
+    torch.randn(1, device=device)
+    return {"passed": not work.is_graph and float(numbers) != 0.0}
 
 
 def attempt(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -305,6 +327,8 @@ def main(arguments: list[str] | None = None) -> int:
                 print(f"    {ms:8.3f} ms {count:7.0f}  {kernel}")
             if options.json:
                 options.json.write_text(json.dumps(results, indent=1))
+    results["a failed capture, check"] = found = attempt(lambda: recover(device))
+    print(f"a failed capture, check: {json.dumps(found)}", flush=True)
     for precision in options.train:
         results[f"train, {precision}"] = found = attempt(lambda: train(device, precision))  # noqa: B023
         print(f"train, {precision}: {json.dumps(found, indent=1)}", flush=True)
