@@ -1,4 +1,4 @@
-"""Parts of an update of PPO that are no products of matrices: layers of ELU, losses with their gradients, Adam."""
+"""Parts of PPO that are no products of matrices: returns, layers of ELU, losses with their gradients, Adam."""
 
 from typing import Any
 
@@ -7,6 +7,32 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 CHUNK = 32  # samples of a partial sum
+
+
+@wp.kernel
+def compute_returns(
+    rewards: wp.array2d(dtype=wp.float32), dones: wp.array2d(dtype=wp.uint8), values: wp.array2d(dtype=wp.float32),
+    last: wp.array(dtype=wp.float32), discount: float, trace: float,
+    returns: wp.array2d(dtype=wp.float32), advantages: wp.array2d(dtype=wp.float32),
+):  # fmt: skip
+    """Compute returns and advantages of a rollout [step, world] backwards from the values of the last observations.
+
+    Schulman et al. 2016, "High-dimensional continuous control using generalized advantage estimation". Threads: worlds.
+    """
+    world = wp.tid()
+    steps = rewards.shape[0]
+    after = last[world]
+    advantage = wp.float32(0.0)
+    for i in range(steps):
+        step = steps - 1 - i
+        value = values[step, world]
+        goes_on = 1.0 - wp.float32(dones[step, world])
+        error = rewards[step, world] + goes_on * discount * after - value
+        advantage = error + goes_on * discount * trace * advantage
+        found = advantage + value
+        returns[step, world] = found
+        advantages[step, world] = found - value
+        after = value
 
 
 @wp.kernel

@@ -150,6 +150,19 @@ def test_fused_gradients_are_those_of_torch(precision, limit):
     assert own_deviation == pytest.approx(deviation, rel=1e-2)  # after the step, and before
 
 
+def test_fused_returns_are_those_of_rsl_rl():
+    env = cart_env(worlds=8, episode_length_s=0.1, seed=3)
+    alg = construct(FusedPPO, env, dataclasses.replace(LEARNER, steps=12))
+    obs = collect(alg, env, env.get_observations())
+    held = alg.storage
+    assert held.dones.any() and not held.dones.all()
+    own = held.returns.clone(), held.advantages.clone()
+    with torch.inference_mode():
+        PPO.compute_returns(alg, obs)
+    for ours, theirs in zip(own, (held.returns, held.advantages), strict=True):
+        assert (ours - theirs).abs().max() < GRADIENT * theirs.abs().max()
+
+
 def test_a_number_that_is_none_reaches_the_guard_of_fused_updates():
     env = cart_env(worlds=4, seed=3)
     for name, term in (("advantages", "surrogate"), ("returns", "value")):

@@ -167,6 +167,8 @@ class CapturedPPO(PPO):
 
     def compute_returns(self, obs: Any) -> None:
         """Compute returns and advantages, as in rsl_rl; advantages keep their place."""
+        if self._fused is not None:
+            return self._fused.compute_returns(self.critic(obs).detach())
         place = self.storage.advantages
         super().compute_returns(obs)
         self.storage.advantages = place.copy_(self.storage.advantages)

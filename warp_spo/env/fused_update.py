@@ -148,6 +148,17 @@ class FusedUpdate:
         """Return the mean deviation of actions."""
         return self.deviations.clamp(*self.alg._raw_actor.distribution.std_range).mean()
 
+    @torch.no_grad()
+    def compute_returns(self, last: torch.Tensor) -> None:
+        """Compute returns and normalised advantages from the values of the last observations [world, 1]."""
+        alg, held = self.alg, self.alg.storage
+        rollout = [x.squeeze(-1) for x in (held.rewards, held.dones, held.values)]
+        results = [held.returns.squeeze(-1), held.advantages.squeeze(-1)]
+        numbers = [*rollout, last.view(-1), alg.gamma, alg.lam, *results]
+        start(kernels.compute_returns, len(last), numbers, self.device)
+        deviation, mean = torch.std_mean(held.advantages)
+        held.advantages.sub_(mean).div_(deviation + 1e-8)
+
     def batch(self, held: Any) -> FusedBatch:
         """Return a minibatch of rsl_rl with the inputs of both networks."""
         alg = self.alg
