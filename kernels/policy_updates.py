@@ -227,3 +227,20 @@ def clip_and_step(
     weights[i] = w
     if copies.shape[0] > 0:
         copies[i] = copies.dtype(w)
+
+
+def add_overloads() -> None:
+    """Name the dtypes of products, so that all kernels are compiled at once."""
+    flat, rows = wp.array(dtype=wp.float32), wp.array2d(dtype=wp.float32)
+    for T in (wp.float32, wp.bfloat16):
+        own = wp.array2d(dtype=T)
+        add_bias_and_elu.add_overload([own, flat])
+        differentiate_elu.add_overload([own, own, rows])
+        surrogate_loss.add_overload([own, flat, flat, float, float, rows, rows, rows, rows, rows, float, own, rows])
+        value_loss.add_overload([own, flat, rows, rows, float, bool, float, own, rows])
+        copies = wp.array(dtype=T)
+        numbers = [flat, flat, flat, flat, copies, int, flat, float, float, float, float, flat, flat]
+        clip_and_step.add_overload(numbers)
+
+
+add_overloads()

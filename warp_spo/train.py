@@ -110,6 +110,7 @@ def learn(parser: Any, options: argparse.Namespace, chosen: Any, learner: Any, g
     """Train in this process, and return the exit status."""
     learning = load_learning(parser)
     from .env import settings
+    from .env.fused_update import start_compiling
     from .env.task_files import build, short_name
     from .env.training_log import draw_curve
 
@@ -119,6 +120,7 @@ def learn(parser: Any, options: argparse.Namespace, chosen: Any, learner: Any, g
     try:
         options.times.mark("the task")
         device = learning.pick_device(options.device)
+        start_compiling(device)
         options.times.mark("the device")
         env = build(chosen, worlds, device, options.seed, options.given, first_world=rank * worlds)
         options.times.mark("the environment")

@@ -63,7 +63,7 @@ class CapturedPPO(PPO):
         self._order = torch.zeros(self.num_mini_batches, size, dtype=torch.int64, device=self.device)
         self._index = self._order[0].clone()
         self._side = torch.cuda.Stream(self.device) if self._on_gpu else None
-        threads = not self._on_gpu and not self.is_multi_gpu and len(os.sched_getaffinity(0)) > 1
+        threads = not self._on_gpu and not self.is_multi_gpu and (os.cpu_count() or 1) > 1
         self._helper = ThreadPoolExecutor(1, "critic") if threads else None
         self._seen: Any = None  # observations from which a rollout starts
         self._env: Any = None
@@ -144,6 +144,7 @@ class CapturedPPO(PPO):
 
     def _act_for_graph(self) -> None:
         self._act(self._acted_on)
+        assert self._values is not None
         self.transition.values = self._values()
         self._acted = {name: getattr(self.transition, name) for name in ACTED}
 

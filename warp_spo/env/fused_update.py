@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -17,6 +18,8 @@ from ..runtime.torch_tensors import stream
 
 ALIGNED = 64  # weights from one array to the next: products read and write whole lines of memory
 WIDE = 8  # entries that products read at once: rows of inputs and of the first weights are filled up with zeros
+
+_compiling: list[threading.Thread] = []  # what start_compiling has begun
 
 
 class FusedBatch(NamedTuple):
@@ -88,6 +91,8 @@ class FusedUpdate:
     """
 
     def __init__(self, alg: Any):
+        while _compiling:
+            _compiling.pop().join()
         self.alg = alg
         device = torch.device(alg.device)
         self.device = str(wp.device_from_torch(device))
@@ -163,9 +168,10 @@ class FusedUpdate:
         """Return a minibatch of rsl_rl with the inputs of both networks."""
         alg = self.alg
         actor, critic = (self._inputs(model.get_latent(held.observations)) for model in (alg.actor, alg.critic))
+        mean, deviation = held.old_distribution_params
         return FusedBatch(
-            actor, critic, held.actions, *held.old_distribution_params, held.old_actions_log_prob, held.advantages,
-            held.values, held.returns,
+            actor, critic, held.actions, mean, deviation, held.old_actions_log_prob, held.advantages, held.values,
+            held.returns,
         )  # fmt: skip
 
     def _inputs(self, latent: torch.Tensor) -> torch.Tensor:
@@ -239,6 +245,15 @@ def find_obstacle(alg: Any) -> str:
     if alg.is_multi_gpu or alg.normalize_advantage_per_mini_batch:
         return "several processes learn" if alg.is_multi_gpu else "advantages are normalised for each minibatch"
     return ""
+
+
+def start_compiling(device: str) -> None:
+    """Compile the kernels for a GPU in a thread of its own, beside those of an environment."""
+    if torch.device(device).type == "cuda":
+        name = str(wp.device_from_torch(torch.device(device)))
+        thread = threading.Thread(target=lambda: wp.load_module(kernels, device=name), daemon=True)
+        thread.start()
+        _compiling.append(thread)
 
 
 def padded(count: int, size: int) -> int:
