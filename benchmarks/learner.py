@@ -46,6 +46,7 @@ from . import command_line
 
 WARM, ITERATIONS, PROFILED = 4, 12, 3
 LISTED = 25  # kernels
+ROUNDED = 1e-4  # of numbers of a rollout, whose returns another kernel sums
 ASKED = {"velocity error": 0.2, "turning error": 0.2, "falls": 0.03}  # [m/s], [rad/s], share
 NEAR = 1e-3  # of the way that weights went: rounding in TF32 may differ where a library picks other kernels for a graph
 CLOSE = 2e-2  # the same, of one update by other kernels: Adam's first steps have the sign of gradients near zero
@@ -207,9 +208,10 @@ def compare(env: Any, variant: Variant, other: type[PPO] | None = None, updates:
     (rollout, before, weights, losses, rate), (other_rollout, _, others, other_losses, other_rate) = found
     far = float((weights - others).norm() / (weights - before).norm())
     same = bool(rollout.equal(other_rollout))
+    near = same or (other is not None and bool((rollout - other_rollout).abs().max() < ROUNDED))
     expected = [[True, True], [False, False]] if other is None else graphs
     return {
-        "passed": same and far < (NEAR if other is None else CLOSE) and graphs == expected,
+        "passed": near and far < (NEAR if other is None else CLOSE) and graphs == expected,
         "rollouts equal to the bit": same,
         "rollouts: largest difference": float((rollout - other_rollout).abs().max()),
         "updates equal to the bit": bool(weights.equal(others)),
