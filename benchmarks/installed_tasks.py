@@ -3,9 +3,9 @@
     python -m benchmarks.installed_tasks [--json FILE]
 
 The environment is a virtual one of its own, made in an empty folder. It takes libraries, pip, and this project from
-where this process finds them, by a ``.pth`` file; the package itself is built and installed into it by pip. ``tasks`` lists the
-names; both are trained for two iterations and resumed for one; one draws a film, measures and exports, the other walks
-in MuJoCo. The table says what each command returned, and its time. It takes some minutes on two cores.
+where this process finds them, by a ``.pth`` file; the package itself is built and installed into it by pip. ``tasks``
+lists the names; both are trained for two iterations and resumed for one; one draws a film, measures and exports, the
+other walks in MuJoCo. The table says what each command returned, and its time. It takes some minutes on two cores.
 """
 
 from __future__ import annotations

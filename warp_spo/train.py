@@ -22,6 +22,7 @@ import os
 import shlex
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
 def start(given: list[str]) -> int:
     """Train in this process, or start those that train."""
     from .command_line import Parser, count, seconds
+    from .env.startup import PRECISIONS, StartTimes
     from .env.task_files import short_name
     from .env.tasks import TASKS, task
     from .env.validation import check_folder
@@ -68,14 +70,20 @@ def start(given: list[str]) -> int:
         "--keep-failures", nargs="?", const="", metavar="FOLDER", dest="failures",
         help="worlds that fail leave files there, to be replayed; without FOLDER: failures, in the folder of --out",
     )  # fmt: skip
+    parser.add_argument("--precision", choices=PRECISIONS, help="of networks on a GPU; left out: tf32")
+    parser.add_argument("--profile-start", action="store_true", help="print the seconds up to the first iteration")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes", help=SET)
     parser.add_argument("--settings", type=Path, metavar="FILE.toml", help="such settings in a file")
     options = parser.parse_args(given)
     if int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) and options.resume is None:
         options.resume = Path("latest")  # torchrun has started anew what was killed
-    load_learning(parser)
+    options.times = StartTimes(BEGAN)
+    options.times.mark("Python and the command line")
+    load_learning(parser, options.times.mark)
     from .env import settings, training_files
 
+    if options.precision is not None:
+        options.changes = [*options.changes, f"learner.precision={options.precision}"]
     try:
         chosen = task(options.task)
         options.out = options.out or Path("runs") / short_name(options.task)
@@ -107,6 +115,7 @@ def learn(parser: Any, options: argparse.Namespace, chosen: Any, learner: Any, g
     """Train in this process, and return the exit status."""
     learning = load_learning(parser)
     from .env import settings
+    from .env.fused_update import start_compiling
     from .env.task_files import build, short_name
     from .env.training_log import draw_curve
 
@@ -114,9 +123,13 @@ def learn(parser: Any, options: argparse.Namespace, chosen: Any, learner: Any, g
     rank, folder, worlds = int(os.environ.get("RANK", 0)), options.out, options.worlds
     name = short_name(options.task)
     try:
+        options.times.mark("the task")
         device = learning.pick_device(options.device)
         kept = {} if options.failures is None else {"keep_failures": options.failures or folder / "failures"}
+        start_compiling(device)
+        options.times.mark("the device")
         env = build(chosen, worlds, device, options.seed, options.given, first_world=rank * worlds, **kept)
+        options.times.mark("the environment")
         print(f"{name}: {worlds} worlds on {device}, {time.time() - BEGAN:.1f} s", flush=True)
         if kept and rank == 0:
             print(f"failures: {env._failures.describe()}", flush=True)
@@ -131,6 +144,9 @@ def learn(parser: Any, options: argparse.Namespace, chosen: Any, learner: Any, g
             settings.write(folder, run, learner, options.given)
     except (ValueError, OSError, ImportError) as error:
         parser.error(str(error))
+    options.times.mark("networks and checkpoints")
+    if options.profile_start and rank == 0:
+        report_start(runner.logger, options.times)
     ending = learning.run(runner, iterations)
     for file in env.failure_files():
         print(f"{file}: {describe_failure(file)}", flush=True)
@@ -164,13 +180,27 @@ def continuation(given: list[str]) -> str:
     return shlex.join(["python", "-m", "warp_spo.train", *kept, "--resume", "latest"])
 
 
-def load_learning(parser: Any) -> Any:
+def load_learning(parser: Any, mark: Callable[[str], None] = lambda name: None) -> Any:
     """Return the module that trains; without rsl_rl the parser says what to install."""
+    from .env.startup import import_learning
+
     try:
-        from .env import learning
+        return import_learning(mark)
     except ImportError as error:
         parser.error(f"{error}; install what learns: pip install -e '.[rl]'")
-    return learning
+
+
+def report_start(log: Any, times: Any) -> None:
+    """Print the seconds of all parts of the start after the first iteration."""
+    after = log.after
+
+    def print_times(iteration: int, total: int) -> None:
+        times.mark("the first iteration")
+        print(times.describe(), flush=True)
+        log.after = after
+        after(iteration, total)
+
+    log.after = print_times
 
 
 if __name__ == "__main__":

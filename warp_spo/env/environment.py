@@ -228,6 +228,11 @@ class Env(VecEnv):
         return self._layout.default_q
 
     @property
+    def is_capturable(self) -> bool:
+        """Whether a CUDA graph can hold steps in a row: not where ``step`` is replaced; known after the first one."""
+        return getattr(self.step, "__func__", None) is Env.step and self.replay.is_capturable
+
+    @property
     def unwrapped(self) -> Env:
         """This environment."""
         return self
@@ -312,8 +317,7 @@ class Env(VecEnv):
         self.actions.copy_(arguments.checked_actions("Env.step", actions, self.num_envs, self.action_labels))
         self.replay()
         self._steps += 1
-        if self._failures is not None:
-            self._failures.look()
+        self.write_failures()
         out = self._store.out.clone()
         extras: dict[str, Any] = {"time_outs": self._store.part(out, "time_out").view(-1)}
         if self._steps % self.log_interval == 0:
@@ -349,6 +353,11 @@ class Env(VecEnv):
     def close(self) -> None:
         """Wait for files of failures that are being written; memory is freed with the object."""
         self.failure_files()
+
+    def write_failures(self) -> None:
+        """Let a thread write what the device has told of worlds that failed; steps do so, but for a graph of many."""
+        if self._failures is not None:
+            self._failures.look()
 
     def failure_files(self) -> list[Path]:
         """Wait for the device, and return the files of ``keep_failures`` that this environment has written."""

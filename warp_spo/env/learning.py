@@ -1,7 +1,6 @@
 """Training of a task by rsl_rl's PPO as it is released: settings, progress, checkpoints.
 
-On CUDA the policy's part of a rollout (actions, values, log-probabilities) is one graph, as the environment's step is.
-The learner, its losses and its storage are rsl_rl's.
+On CUDA a rollout is one graph, and an update another: :class:`CapturedPPO`. Networks and storage are rsl_rl's.
 """
 
 from __future__ import annotations
@@ -19,14 +18,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rsl_rl.algorithms import PPO
 from rsl_rl.modules.distribution import GaussianDistribution
 
 from ..runtime.arrays import parse_device
 from . import training_files
+from .captured_ppo import CapturedPPO
 from .environment import Env
 from .loggers import checked
 from .runner import Runner, describe_end, load_checkpoint, run
+from .startup import PRECISIONS
 from .training_log import TrainingLog
 from .validation import check_folder, check_number, check_positive, check_whole
 
@@ -42,7 +42,8 @@ class Learner:
         steps: of each world in an iteration. hidden: widths of the layers of actor and critic.
         deviation: of the first actions. discount, trace: gamma and lambda. rate: first learning rate; target: of the
             KL divergence, to which the rate adapts. epochs, batches: of each iteration. entropy: weight of its bonus.
-        normalize: whether observations are normalised by their mean and deviation.
+        normalize: whether observations are normalised by their mean and deviation. precision: of the networks' products
+            on a GPU: "float32"; "tf32"; "bfloat16" in updates, with weights and losses in float32.
 
     Raises:
         ValueError: a setting is none; the message names it.
@@ -61,6 +62,7 @@ class Learner:
     batches: int = 4
     entropy: float = 0.01
     normalize: bool = True
+    precision: str = "tf32"
 
     def __post_init__(self) -> None:
         for name in ("iterations", "worlds", "steps", "epochs", "batches"):
@@ -78,6 +80,8 @@ class Learner:
         check_number("Learner", "entropy", self.entropy, 0.0)
         if not isinstance(self.normalize, bool):
             raise ValueError(f"Learner: normalize is {self.normalize!r}; expected True or False")
+        if self.precision not in PRECISIONS:
+            raise ValueError(f"Learner: precision is {self.precision!r}; expected one of {', '.join(PRECISIONS)}")
 
     def settings(self, env: Env, save_interval: int) -> dict[str, Any]:
         """Return the settings in rsl_rl's words.
@@ -108,6 +112,7 @@ class Learner:
                 "clip_param": 0.2, "gamma": self.discount, "lam": self.trace, "value_loss_coef": 1.0,
                 "entropy_coef": self.entropy, "learning_rate": self.rate, "max_grad_norm": 1.0, "schedule": "adaptive",
                 "desired_kl": self.target, "use_clipped_value_loss": True,
+                "use_mixed_precision": self.precision == "bfloat16",
             },
         }  # fmt: skip
 
@@ -120,138 +125,10 @@ class Gaussian(GaussianDistribution):
         return self.mean + self.std * torch.randn_like(self.mean)
 
 
-class CapturedPPO(PPO):
-    """rsl_rl's PPO, whose ``act`` is one CUDA graph after the first call; on a CPU it is PPO.
-
-    Models that cannot be captured act without a graph, and a warning says so.
-    """
-
-    graph: Any = None
-    captures = True
-    _kept: tuple[torch.Tensor, ...] = ()  # what was learned before this iteration
-    _kept_rate = 0.0
-
-    def act(self, obs: Any) -> torch.Tensor:
-        """Sample actions and keep what the storage needs, as PPO does."""
-        if torch.device(self.device).type != "cuda" or self.actor.is_recurrent or not self.captures:
-            return super().act(obs)
-        if self.graph is None:
-            before = torch.cuda.get_rng_state(self.device)
-            super().act(obs)  # warms up, and draws nothing: a training that resumes has the same numbers
-            torch.cuda.set_rng_state(before, self.device)
-            self.seen, graph = obs.clone(), torch.cuda.CUDAGraph()
-            try:
-                with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # NCCL has threads of its own
-                    super().act(self.seen)
-            except RuntimeError as error:
-                warnings.warn(f"train: the policy acts without a CUDA graph: {error}", stacklevel=2)
-                self.captures = False
-                return super().act(obs)
-            self.graph = graph
-            self.acted = {name: getattr(self.transition, name) for name in KEPT}
-        for name, value in self.seen.items():
-            value.copy_(obs[name])
-        self.graph.replay()
-        for name, value in self.acted.items():
-            setattr(self.transition, name, value)
-        self.transition.observations = obs
-        return self.transition.actions  # type: ignore[return-value]
-
-    def update(self) -> dict[str, float]:
-        """Learn, and keep the normalisers' deviations where the graph reads them.
-
-        Raises:
-            NotFiniteError: the policy is not finite any more; it is again what it was before, and so is the optimizer.
-        """
-        self._keep()
-        models = [model.obs_normalizer for model in (self.actor, self.critic) if model.obs_normalization]
-        places = [model._std for model in models]
-        losses = super().update()
-        with torch.inference_mode():
-            for model, place in zip(models, places, strict=True):
-                place.copy_(model._std)
-                model._std = place
-        if not self._is_finite():
-            self._keep(back=True)
-            raise NotFiniteError(self._find_term())
-        return losses
-
-    def _learned(self) -> list[torch.Tensor]:
-        """Return the tensors that learning changes: networks, normalisers, the optimizer's state."""
-        networks = [*self._raw_actor.state_dict().values(), *self._raw_critic.state_dict().values()]
-        state = [value for each in self.optimizer.state.values() for value in each.values()]
-        return networks + [value for value in state if isinstance(value, torch.Tensor)]
-
-    @torch.no_grad()
-    def _keep(self, back: bool = False) -> None:
-        """Copy what learning changes; ``back``: make it what it was, the learning rate, too."""
-        tensors = self._learned()
-        if back:
-            steps = len(self._kept) < len(tensors)  # the optimizer had taken none
-            torch._foreach_copy_(tensors[: len(self._kept)], self._kept)
-            self.learning_rate = self._kept_rate
-            for group in self.optimizer.param_groups:
-                group["lr"] = self.learning_rate
-            if steps:
-                self.optimizer.state.clear()
-            return
-        if [x.shape for x in self._kept] != [x.shape for x in tensors]:
-            self._kept = tuple(torch.empty_like(x) for x in tensors)
-        torch._foreach_copy_(self._kept, tensors)
-        self._kept_rate = self.learning_rate
-
-    def _is_finite(self) -> bool:
-        """Return whether networks and normalisers hold finite numbers alone, the same in all processes."""
-        models = (self._raw_actor, self._raw_critic)
-        numbers = [x for model in models for x in model.state_dict().values() if x.is_floating_point()]
-        return bool(torch.stack(torch._foreach_norm(numbers, math.inf)).isfinite().all())
-
-    def _find_term(self) -> str:
-        """Learn again from the same rollout up to the first gradient that is not finite; name the terms of its loss."""
-
-        def look(optimizer: Any, *_: Any) -> None:
-            gradients = [w.grad for group in optimizer.param_groups for w in group["params"] if w.grad is not None]
-            if not bool(torch.stack(torch._foreach_norm(gradients, math.inf)).isfinite().all()):
-                raise FloatingPointError
-
-        hook = self.optimizer.register_step_pre_hook(look)
-        try:
-            super().update()
-        except FloatingPointError as error:
-            terms = loss_terms(error)
-            bad = [name for name, value in terms.items() if not math.isfinite(value)]
-            others = "the loss of another process" if self.is_multi_gpu else "the gradient of a finite loss"
-            return f"loss {', '.join(bad)} not finite" if bad else f"{others} is not finite"
-        finally:
-            hook.remove()
-            self._keep(back=True)
-        return "observations that are not finite reached the normalisers"
-
-
-class NotFiniteError(FloatingPointError):
-    """Learning has made a policy that is not finite; the message names the terms of the loss."""
-
-
-def loss_terms(error: BaseException) -> dict[str, float]:
-    """Return the terms of the loss where an error interrupted rsl_rl's ``PPO.update``, by their names in the log."""
-    frame = error.__traceback__
-    while frame is not None:
-        found = frame.tb_frame.f_locals
-        if "surrogate_loss" in found:
-            names = {"surrogate": "surrogate_loss", "value": "value_loss", "entropy": "entropy"}
-            return {name: float(found[local].detach().mean()) for name, local in names.items()}
-        frame = frame.tb_next
-    return {}
-
-
-KEPT = ("actions", "values", "actions_log_prob", "distribution_params", "hidden_states")
-
-
 def pick_device(asked: str | None) -> str:
     """Return the device to learn on: what is asked for, or this process's GPU, or "cpu".
 
-    On a CPU torch takes one thread: networks are small, and several threads wait for each other. On a GPU networks
-    multiply matrices in TF32; the dynamics do not.
+    On a CPU torch takes one thread: networks are small, and several threads wait for each other.
     """
     local = os.environ.get("LOCAL_RANK", "0")
     device = asked or (f"cuda:{local}" if torch.cuda.is_available() else "cpu")
@@ -259,8 +136,25 @@ def pick_device(asked: str | None) -> str:
         torch.set_num_threads(1)
     else:
         torch.cuda.set_device(device)
-        torch.set_float32_matmul_precision("high")
     return device
+
+
+def check_precision(precision: str, device: str) -> None:
+    """Raise ValueError where a device cannot learn by a precision."""
+    if precision != "bfloat16":
+        return
+    on_gpu = torch.device(device).type == "cuda"
+    if not on_gpu or torch.cuda.get_device_capability(device) < (8, 0):
+        name = torch.cuda.get_device_name(device) if on_gpu else "a CPU"
+        raise ValueError(
+            f"Learner: precision is 'bfloat16' on {device}, {name}; expected a GPU of compute capability 8.0 or above, "
+            "or 'float32' or 'tf32'"
+        )
+
+
+def set_precision(precision: str) -> None:
+    """Let torch multiply matrices of float32 in TF32 or not; the dynamics never do."""
+    torch.set_float32_matmul_precision("highest" if precision == "float32" else "high")
 
 
 def make_runner(
@@ -271,6 +165,7 @@ def make_runner(
     for name, value in (("save_interval", save_interval), ("every", every)):
         check_whole("train", name, value, 1)
     check_positive("train", "seconds", seconds, endless=True)
+    set_precision(learner.precision)
     with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints every layer of both networks
         runner = Runner(env, learner.settings(env, save_interval), str(env.device))
     began = time.time() if began is None else began
@@ -289,6 +184,7 @@ def prepare(
 ) -> tuple[Runner, int]:  # fmt: skip
     """Return a runner that is ready to train, and how many iterations are left; see :func:`train`."""
     check_folder(folder, resume)
+    check_precision(learner.precision, str(env.device))
     if iterations is not None:
         check_whole("train", "iterations", iterations, 1)
     torch.manual_seed(check_whole("train", "seed", seed, 0, 2**64 - 1))

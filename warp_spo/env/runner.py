@@ -27,6 +27,22 @@ class TrainingStopped(Exception):
     """A signal came, or the time that a training may take is over."""
 
 
+class Instant:
+    """A moment of the work on a device; a difference of two are seconds."""
+
+    def __init__(self, device: Any):
+        self.event = torch.cuda.Event(enable_timing=True) if torch.device(device).type == "cuda" else None
+        self.seconds = time.perf_counter()
+        if self.event is not None:
+            self.event.record()
+
+    def __sub__(self, before: Instant) -> float:
+        if self.event is None or before.event is None:
+            return self.seconds - before.seconds
+        self.event.synchronize()
+        return 1e-3 * before.event.elapsed_time(self.event)
+
+
 class Ending(NamedTuple):
     """How a training ended.
 
@@ -57,11 +73,40 @@ class Runner(OnPolicyRunner):
         finished: the last whole iteration. unwritten: by name of a file why it could not be written.
     """
 
+    current_learning_iteration: int
     resumed, finished = False, -1
 
     def __init__(self, env: Env, settings: dict[str, Any], device: str):
         super().__init__(env, settings, None, device=device)
         self.stop, self.unwritten = StopRequest(), dict[str, str]()
+
+    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
+        """Learn for so many iterations, as rsl_rl does, with rollouts that may be one launch."""
+        alg: Any = self.alg
+        if getattr(alg, "obstacle", "other algorithm"):
+            return super().learn(num_learning_iterations, init_at_random_ep_len)
+        if init_at_random_ep_len:
+            lengths = self.env.episode_length_buf
+            self.env.episode_length_buf = torch.randint_like(lengths, high=int(self.env.max_episode_length))
+        obs = self.env.get_observations().to(self.device)
+        alg.train_mode()
+        if self.is_distributed:
+            alg.broadcast_parameters()
+        self.logger.init_logging_writer()
+        first = self.current_learning_iteration
+        for iteration in range(first, first + num_learning_iterations):
+            began = Instant(self.device)
+            obs = alg.collect(self.env, obs)
+            self.env.write_failures()  # type: ignore[attr-defined]
+            collected = Instant(self.device)
+            losses = alg.update()
+            learned = Instant(self.device)
+            self.current_learning_iteration = iteration
+            self.logger.log(
+                it=iteration, start_it=first, total_it=first + num_learning_iterations,
+                collect_time=collected - began, learn_time=learned - collected, loss_dict=losses,
+                learning_rate=alg.learning_rate, action_std=alg.deviation, rnd_weight=None, env_log=alg.log,
+            )  # fmt: skip
 
     def save(self, path: str, infos: dict | None = None) -> None:
         """Save networks, the optimizer's state, and how far this process's worlds have come in curricula."""

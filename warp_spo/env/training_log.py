@@ -80,8 +80,10 @@ class TrainingLog:
     def _write(
         self, it: int, total_it: int, collect_time: float, learn_time: float, loss_dict: dict, others: dict
     ) -> None:
-        found = self.env.log()
-        numbers = torch.stack([value.float() for value in found.values()]).tolist()
+        found = others.get("env_log")
+        if not found:
+            held = self.env.log()
+            found = dict(zip(held, torch.stack([value.float() for value in held.values()]).tolist(), strict=True))
         row: dict[str, float] = {
             "iteration": it,
             "seconds": time.time() - self.began,
@@ -91,7 +93,7 @@ class TrainingLog:
             "rate": float(others["learning_rate"]),
             **peak_memory(self.env.device),
             **{f"loss/{name}": float(value) for name, value in loss_dict.items()},
-            **dict(zip(found, numbers, strict=True)),
+            **found,
         }
         row["reward"] = sum(value for name, value in row.items() if name.startswith("/reward/"))
         self.rows.append(row)

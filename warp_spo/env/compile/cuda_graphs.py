@@ -1,7 +1,8 @@
-"""How the parts of a step run: on CUDA as one graph, or as several around terms that a graph cannot hold."""
+"""Work that is repeated as CUDA graphs: functions, and the steps of environments whose terms may not fit a graph."""
 
 from __future__ import annotations
 
+import gc
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -23,6 +24,62 @@ def run_all(works: Sequence[Callable[[], None]], device: torch.device | None = N
     else:
         for work in works:
             work()
+
+
+class Captured:
+    """A function without arguments that is a CUDA graph after its first calls; on a CPU it is the function.
+
+    Its tensors have to stay at their places. First calls run on the stream of the capture, since autograd keeps the
+    stream on which it met a parameter first. A function that cannot be captured is called each time, and a warning
+    says why.
+
+    Args:
+        function: what is repeated. device: where it runs. what: words for the warning. plain: calls before the capture.
+        captures: False: never.
+    """
+
+    def __init__(self, function: Callable[[], None], device: Any, what: str, plain: int = 1, captures: bool = True):
+        self._function, self._what, self._plain = function, what, plain
+        device = torch.device(device)
+        self._stream = torch.cuda.Stream(device) if captures and device.type == "cuda" else None
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    @property
+    def is_graph(self) -> bool:
+        """Whether calls replay a graph."""
+        return self._graph is not None
+
+    def __call__(self) -> None:
+        """Run, or replay, on torch's current stream; inside of another capture: become part of it."""
+        if self._graph is not None:
+            self._graph.replay()
+        elif self._stream is None or torch.cuda.is_current_stream_capturing():
+            self._function()
+        elif self._plain == 0 and self._capture(self._stream):
+            self()
+        else:
+            self._plain -= 1
+            self._stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(self._stream):
+                self._function()
+            torch.cuda.current_stream().wait_stream(self._stream)
+
+    def _capture(self, stream: torch.cuda.Stream) -> bool:
+        """Capture the function, and return whether that went well."""
+        gc.collect()  # a graph that is destroyed meanwhile would break the capture
+        graph = torch.cuda.CUDAGraph()
+        try:  # NCCL and others have threads of their own, which may do as they like
+            with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
+                self._function()
+        except Exception as error:
+            why = f"{error or type(error).__name__}".splitlines()[0]
+            warnings.warn(f"{self._what} runs without a CUDA graph: {why}", stacklevel=3)
+            torch.cuda.synchronize()
+            with torch.cuda.graph(torch.cuda.CUDAGraph(), stream=stream):  # else torch takes later draws for captured
+                torch.zeros(1, device=stream.device)
+            return False
+        self._graph = graph
+        return True
 
 
 class Part(NamedTuple):
@@ -58,8 +115,17 @@ class Replay:
         """How many graphs make a step; 0 before the second step and where nothing is captured."""
         return 0 if self._pieces is None else sum(1 for piece in self._pieces if hasattr(piece, "__self__"))
 
+    @property
+    def is_capturable(self) -> bool:
+        """Whether a graph can hold a whole step; known after the first step."""
+        return self._graphs and not self._eager and self._steps > 0
+
     def __call__(self) -> None:
-        """Run one step."""
+        """Run one step; inside of another capture: become part of it."""
+        if self._graphs and torch.cuda.is_current_stream_capturing():
+            for part in self._parts:
+                part.run()
+            return
         if self._pieces is None and self._graphs and self._steps > 0:
             self._capture()
         for piece in self._pieces if self._pieces is not None else [part.run for part in self._parts]:
