@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from . import torch as torch
     from .mujoco import from_mujoco
     from .newton import from_newton, load
+    from .viewing.robot_view import view
 
     __version__: str
 
@@ -78,6 +79,7 @@ __all__ = [
     "normal_modes",
     "spline",
     "terrain",
+    "view",
     "where",
 ]
 
@@ -91,7 +93,7 @@ if not TYPE_CHECKING:  # or every misspelled name would pass a type checker
             return getattr(importlib.import_module(".newton", __name__), name)
         if name == "from_mujoco":
             return importlib.import_module(".mujoco", __name__).from_mujoco
-        if name in ("jax", "mujoco", "newton", "torch"):
+        if name in ("jax", "mujoco", "newton", "torch", "view"):
             return importlib.import_module(f".{name}", __name__)
         if name == "__version__":
             from importlib.metadata import PackageNotFoundError, version
