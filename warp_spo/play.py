@@ -2,11 +2,12 @@
 
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt                  # FILE.gif and FILE.png beside it
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --measure        # and errors over 256 worlds
-    python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --view           # in Newton's viewer, on a display
+    python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --view           # live, in a browser; no film
+    python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --html walk.html # one page with a time slider; no film
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --export policy  # policy.onnx, policy.pt, no film
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --mujoco         # 64 robots walk in MuJoCo; no film
 
-With ``--export`` or ``--mujoco`` a film is drawn only where ``--film`` or ``--view`` asks for it.
+With ``--export``, ``--mujoco``, ``--view`` or ``--html`` a film is drawn only where ``--film`` asks for it.
 Films are drawn without a display, on the device of the environment.
 """
 
@@ -40,8 +41,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, help="name of the film; left out: that of the checkpoint")
     parser.add_argument("--film", choices=("gif", "webp", "mp4"), help="gif unless told; mp4 needs imageio-ffmpeg")
     parser.add_argument("--measure", action="store_true", help="print what the task asks for, over --worlds worlds")
-    parser.add_argument("--worlds", type=count, default=256)
-    parser.add_argument("--view", action="store_true", help="show Newton's viewer")
+    parser.add_argument("--worlds", type=count, help="of --measure, 256 unless told, and of --view, 16")
+    parser.add_argument("--view", action="store_true", help="let it act in a browser, until Ctrl-C: needs viser")
+    parser.add_argument("--host", default="127.0.0.1", help="address that --view listens on")
+    parser.add_argument("--port", type=int, default=8080, help="the first that --view tries")
+    parser.add_argument("--html", type=Path, metavar="FILE", help="write --seconds of one world as a page: needs viser")
     parser.add_argument("--mujoco", action="store_true", help="let 64 robots walk in MuJoCo, on the CPU")
     parser.add_argument("--export", type=Path, help="write NAME.onnx and NAME.pt, TorchScript")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes", help=SET)
@@ -54,7 +58,7 @@ def main(arguments: list[str] | None = None) -> int:
     from .viewing import films
 
     own = short_name(options.task)
-    worlds = options.worlds if options.measure else 1
+    worlds = options.worlds or 256 if options.measure else options.worlds or 16 if options.view else 1
     name = options.out or options.checkpoint.with_suffix("")
     try:
         chosen = task(options.task)
@@ -82,20 +86,20 @@ def main(arguments: list[str] | None = None) -> int:
             print(json.dumps(walk_in_mujoco(runner, env, own, chosen), indent=1))
         except (ValueError, OSError) as error:
             parser.error(str(error))
-    if options.film is None and (options.export or options.mujoco) and not options.view:
-        return 0  # an export, or a run in MuJoCo, alone
+    if options.html or options.view:
+        try:
+            look_at(options, chosen, runner, env, policy)
+        except (ValueError, OSError) as error:
+            parser.error(str(error))
+    if options.film is None and (options.export or options.mujoco or options.view or options.html):
+        return 0  # none of these needs a film
     suffix = f".{options.film or 'gif'}"
     if getattr(chosen, "ROBOT", None) not in robots.NAMES or not hasattr(chosen, "CAMERA"):
-        if options.view:
-            recorded = recording.record(env, policy, options.seconds, options.command)
-            recording.show(robot_file(chosen), recorded, env.step_dt)
         camera = getattr(chosen, "CAMERA", None)
         for file in recording.play(env, policy, name, options.seconds, options.command, camera, suffix):
             print(file)
         return 0
     recorded = recording.record(env, policy, options.seconds, options.command)
-    if options.view:
-        recording.show(robot_file(chosen), recorded, env.step_dt)
     frames = recording.film(chosen, recorded, recording.STEPS_A_PICTURE)
     print(films.save(frames, name.with_suffix(suffix), recording.STEPS_A_PICTURE * env.step_dt))
     strip = recording.strip(chosen, recorded)
@@ -119,13 +123,15 @@ def checked(options: argparse.Namespace, chosen: Any) -> dict[str, str]:
     tracks = options.task not in TASKS or getattr(chosen, "ACTOR", [("",)])[0][0] == "base velocity"
     if options.mujoco and not tracks:  # of other tasks the exported file says it
         raise ValueError(f"--mujoco with {options.task}; expected a task that tracks velocities, such as go2-flat")
-    for asked, name in (options.view, "--view"), (options.mujoco, "--mujoco"):
-        if asked and not hasattr(chosen, "ROBOT"):
-            raise ValueError(f"{name} with {options.task}; expected a task with ROBOT, the path of its MJCF file")
-    for asked, module in (options.film == "mp4", "imageio_ffmpeg"), (options.view, "pyglet"):
-        if asked and importlib.util.find_spec(module) is None:
-            raise ImportError(f"{module} is missing; pip install {module.replace('_', '-')}")
-    for file in (options.out, options.export):
+    if options.mujoco and not hasattr(chosen, "ROBOT"):
+        raise ValueError(f"--mujoco with {options.task}; expected a task with ROBOT, the path of its MJCF file")
+    if options.film == "mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise ImportError("imageio_ffmpeg is missing; pip install imageio-ffmpeg")
+    if options.view or options.html:
+        from .viewing.browser import load_viser
+
+        load_viser()
+    for file in (options.out, options.export, options.html):
         if file is not None:
             file.parent.mkdir(parents=True, exist_ok=True)
     return {} if options.trial is None else {"trial": options.trial}
@@ -137,6 +143,35 @@ def robot_file(chosen: Any) -> Path:
 
     robot = str(chosen.ROBOT)
     return robots.FILES / f"{robot}.xml" if robot in robots.NAMES else Path(chosen.__file__).parent / robot
+
+
+def look_at(options: argparse.Namespace, chosen: Any, runner: Any, env: Any, policy: Any) -> None:
+    """Write a page of the policy's motion, and let it act in a browser until Ctrl-C, as the arguments ask."""
+    from .env import evaluation, learning
+    from .env.task_files import short_name
+    from .env.training_files import checkpoint_names
+    from .viewing.appearance import file_appearance
+    from .viewing.policy_view import Checkpoints, PolicyView
+
+    folder, file = options.checkpoint.parent, robot_file(chosen) if hasattr(chosen, "ROBOT") else None
+    appearance = None if file is None or not file.is_file() else file_appearance(file, env.scene)
+
+    def load(name: str) -> Any:
+        learning.load_checkpoint(runner, folder / name, learns=False)
+        return learning.policy_of(runner)
+
+    checkpoints = Checkpoints(lambda: checkpoint_names(folder), load)
+    title, port = f"{short_name(options.task)}", options.port
+    page = PolicyView(env, policy, title, appearance, checkpoints, options.checkpoint.name, options.host, port)
+    with evaluation.hold(env, options.command):
+        if options.html:
+            options.html.write_text(page.as_html(options.seconds))
+            print(options.html)
+        if options.view:
+            print(f"{options.task}: {page.page.url} (Ctrl-C ends it)", flush=True)
+            page.run()
+        else:
+            page.close()
 
 
 def walk_in_mujoco(runner: Any, env: Any, name: str, chosen: Any, worlds: int = 64) -> dict[str, float]:

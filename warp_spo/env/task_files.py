@@ -155,7 +155,7 @@ HEADER = """\
 # A training needs build and LEARNER; all else may go.
 """
 COMMENTS = (
-    ("ROBOT = ", "# A ready robot, or the path of an MJCF file of yours, which play --view and --mujoco show.\n"),
+    ("ROBOT = ", "# A ready robot, or the path of an MJCF file of yours, which play --view draws and --mujoco runs.\n"),
     ("CAMERA = ", "# Where films are taken from.\n"),
     ("LEARNER = ", "# Settings of PPO: --set learner.NAME=VALUE changes one for a training.\n"),
     (

@@ -43,12 +43,10 @@ def file_appearance(file: Path, scene: Scene) -> Appearance:
     Args:
         file: URDF, MJCF or USD. scene: as :func:`warp_spo.load` returns it, whose bodies carry the surfaces.
     """
-    from ..newton.files.load import robot_format
-
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the loader of the scene has said them
-            found = _mjcf(file) if robot_format(file) == "mjcf" else _imported(file, scene)
+            found = _mjcf(file) if file.suffix.lower() in (".xml", ".mjcf") else _imported(file, scene)
     except Exception as error:  # importers raise whatever they meet in a damaged file
         plain = scene_appearance(scene)
         words = f"what the file draws cannot be read ({type(error).__name__}: {shown(str(error))}); bones are drawn"

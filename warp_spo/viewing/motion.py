@@ -58,7 +58,8 @@ class Motion:
 
     Attributes:
         q, qd: state [1, coordinate] and [1, dof]. time: since the last start [s]. status: of the last step.
-        dt: of a step [s]. passes: of contacts; None: as a rule. notes: what differs from the scene, in words. held: whether drives and servos hold the pose of the start.
+        dt: of a step [s]. passes: of contacts; None: as a rule.
+        notes: what differs from the scene, in words. held: whether drives and servos hold the pose of the start.
     """
 
     def __init__(self, scene: Scene):

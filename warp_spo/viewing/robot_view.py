@@ -20,6 +20,7 @@ from .browser import HOST, PORT, WORLD, BodyLayer, Pace, Page
 from .curves import Curves
 from .motion import GROUNDS, Motion, Pull, make_ground
 from .overlays import ORANGE, Arrows, Overlays, point_places
+from .pose import extent, first_pose, floats
 from .robot_text import describe_robot
 from .sliders import JointSliders
 
@@ -54,7 +55,7 @@ class RobotView:
         self.q = first_pose(scene)
         self.poses = self._kinematics.body_poses(self.q[None])[0]
         low, high = extent(appearance, self.poses)
-        if _floats(scene) and not scene.keyframes:
+        if floats(scene) and not scene.keyframes:
             self.q[2] -= low[2]  # stands on the ground
             self.poses = self._kinematics.body_poses(self.q[None])[0]
             low, high = extent(appearance, self.poses)
@@ -171,7 +172,7 @@ class RobotView:
             self.motion = Motion(scene)
             self.page.show_ground(ground if ground is not None else Plane())
         q = self.sliders.q.copy()
-        if _floats(self.scene):
+        if floats(self.scene):
             q[2] += float(self.numbers["height"].value)
         self._settings()
         self.motion.start(q)
@@ -275,7 +276,7 @@ class RobotView:
         for layer in self.layers.values():
             layer.place(self.poses[None])
         self.overlays.place(self.poses)
-        if self.boxes["follow"].value and _floats(self.scene) and self.motion is not None:
+        if self.boxes["follow"].value and floats(self.scene) and self.motion is not None:
             self.page.follow(self.poses[0])
         elif self.motion is None:
             self.page.follow((0.0, 0.0))
@@ -376,33 +377,3 @@ def load_with_notes(file: Path, contacts: Any, options: dict[str, Any]) -> tuple
         return read(contacts), [*notes, "the file has no ground: it stands on the plane z = 0"]
     except ValueError:
         return scene, notes
-
-
-def first_pose(scene: Scene) -> np.ndarray:
-    """Return the coordinates of a scene's first keyframe; without one the neutral ones, within the joints' limits."""
-    for key in scene.keyframes.values():
-        return np.array(key.q, np.float64)
-    q = scene.neutral_q.copy()
-    low, high = (scene.values[f"joint_limit_{name}"][0] for name in ("lower", "upper"))
-    for hinge in range(len(scene.hinges)):
-        coords, dofs = (slice(int(s[hinge]), int(s[hinge + 1])) for s in (scene.q_start, scene.qd_start))
-        if coords.stop - coords.start == dofs.stop - dofs.start:
-            q[coords] = np.clip(q[coords], low[dofs], high[dofs])
-    return q
-
-
-def extent(appearance: Appearance, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and the highest corner of the box about what is drawn of the bodies [m]."""
-    from ..reference.rotations import rotation
-
-    found = [
-        surface.vertices @ rotation(poses[surface.body, 3:]).T + poses[surface.body, :3]
-        for surface in appearance.drawn
-        if surface.body >= 0 and len(surface.vertices)
-    ]
-    corners = np.concatenate([*found, poses[:, :3]])
-    return corners.min(axis=0), corners.max(axis=0)
-
-
-def _floats(scene: Scene) -> bool:
-    return scene.hinges[0].coord_count == 7 and scene.hinges[0].parent < 0
