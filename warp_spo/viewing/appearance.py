@@ -14,6 +14,7 @@ from .shapes import primitives
 from .surfaces import Surface, merged, mesh_surface, primitive_surface, shape_surface
 
 GREY, COLLISION = (0.62, 0.66, 0.72), (0.95, 0.55, 0.12)
+LONGEST_NOTE = 400  # letters of what an importer says
 DRAWN_GROUPS = 3  # MuJoCo draws geoms of the groups 0, 1 and 2 unless told otherwise
 MJCF_KINDS = {2: "sphere", 3: "capsule", 4: "ellipsoid", 5: "cylinder", 6: "box", 7: "mesh"}
 """MuJoCo's number of a kind of geom -> its name."""
@@ -44,12 +45,16 @@ def file_appearance(file: Path, scene: Scene) -> Appearance:
         file: URDF, MJCF or USD. scene: as :func:`warp_spo.load` returns it, whose bodies carry the surfaces.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the loader of the scene has said them
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
             found = _mjcf(file) if file.suffix.lower() in (".xml", ".mjcf") else _imported(file, scene)
+        said = dict.fromkeys(str(each.message) for each in caught if issubclass(each.category, UserWarning))
+        found = found._replace(
+            notes=[*found.notes, *(f"of its pictures: {shown(text, LONGEST_NOTE)}" for text in said)]
+        )
     except Exception as error:  # importers raise whatever they meet in a damaged file
         plain = scene_appearance(scene)
-        words = f"what the file draws cannot be read ({type(error).__name__}: {shown(str(error))}); bones are drawn"
+        words = f"what the file draws cannot be read ({type(error).__name__}: {shown(str(error), LONGEST_NOTE)}); bones are drawn"
         return plain._replace(notes=[words])
     if not found.drawn and not found.collision:
         plain = scene_appearance(scene)

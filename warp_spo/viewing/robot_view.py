@@ -20,7 +20,7 @@ from .browser import HOST, PORT, WORLD, BodyLayer, Pace, Page
 from .curves import Curves
 from .motion import GROUNDS, Motion, Pull, make_ground
 from .overlays import ORANGE, Arrows, Overlays, point_places
-from .pose import extent, first_pose, floats
+from .pose import close, closed_pose, extent, first_pose, floats
 from .robot_text import describe_robot
 from .sliders import JointSliders
 
@@ -53,6 +53,8 @@ class RobotView:
         except ValueError:  # loops that embedding does not take
             self._kinematics = Dynamics(still, 1, "cpu", "float64", loops="multipliers")
         self.q = first_pose(scene)
+        if self._kinematics.closed:
+            self.q = closed_pose(self._kinematics, self.q)
         self.poses = self._kinematics.body_poses(self.q[None])[0]
         low, high = extent(appearance, self.poses)
         if floats(scene) and not scene.keyframes:
@@ -79,6 +81,7 @@ class RobotView:
             collections.deque()
         )  # by buttons, which run in other threads
         self.numbers: dict[str, Any] = {}
+        self._closed = self.q.copy()  # the last coordinates at which the loops are closed
         self._panel()
         self._draw()
 
@@ -148,9 +151,10 @@ class RobotView:
             position=tuple(map(float, self._pull.target)),
         )  # fmt: skip
 
-        @self._grip.on_drag_end
-        def _(_: Any) -> None:
-            self._asked.append(self.let_go)
+        @self._grip.on_update
+        def _(event: Any) -> None:
+            if event.phase == "end":
+                self._asked.append(self.let_go)
 
     def _click(self, body: int) -> None:
         self._asked.append(lambda: self.pull(body))
@@ -220,10 +224,10 @@ class RobotView:
             return
         self.q[:] = self.sliders.q
         if self._kinematics.closed:
-            closed = self._kinematics.project(self.q[None], iterations=10)[0]
-            if np.isfinite(closed).all():
-                self.q[:] = closed
-                self.sliders.write(self.q)
+            found = close(self._kinematics, self.q)
+            self.q[:] = self._closed if found is None else found
+            self._closed = self.q.copy()
+            self.sliders.write(self.q)
         self._place()
 
     def _move(self, seconds: float) -> None:
@@ -374,6 +378,7 @@ def load_with_notes(file: Path, contacts: Any, options: dict[str, Any]) -> tuple
         return scene, notes
     try:
         options = options | {"ground": Plane()}
-        return read(contacts), [*notes, "the file has no ground: it stands on the plane z = 0"]
+        scene = read(contacts)
     except ValueError:
         return scene, notes
+    return scene, [*notes, *["the file has no ground: it stands on the plane z = 0"] * bool(scene.contacts)]
