@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from support.env_scenes import cart_env
 
+from support.env_scenes import cart_env
 from warp_spo.env import commands, observations, recording
 from warp_spo.viewing.policy_view import Checkpoints
 

@@ -1,4 +1,4 @@
-"""The page of a robot, driven through viser's handles without a browser: what it sends, beside MuJoCo and closed forms."""
+"""The page of a robot, driven through viser's handles without a browser, beside MuJoCo and closed forms."""
 
 import json
 import subprocess
@@ -150,7 +150,7 @@ def test_a_robot_falls_is_held_and_steps(leg):
     assert sum(page.energy.rows[0][1:3]) == pytest.approx(page.energy.rows[0][3])
     place = motion.dyn.com(motion.q)[0].copy()
     page.pull(0)
-    page._grip.position = tuple(page._pull.target + [0.0, 0.0, 0.5])
+    page._grip.position = (*page._pull.target[:2], page._pull.target[2] + 0.5)
     for _ in range(10):
         page.tick(0.1)
     assert motion.dyn.com(motion.q)[0, 2] > place[2] + 0.05

@@ -54,7 +54,8 @@ def file_appearance(file: Path, scene: Scene) -> Appearance:
         )
     except Exception as error:  # importers raise whatever they meet in a damaged file
         plain = scene_appearance(scene)
-        words = f"what the file draws cannot be read ({type(error).__name__}: {shown(str(error), LONGEST_NOTE)}); bones are drawn"
+        why = f"{type(error).__name__}: {shown(str(error), LONGEST_NOTE)}"
+        words = f"what the file draws cannot be read ({why}); bones are drawn"
         return plain._replace(notes=[words])
     if not found.drawn and not found.collision:
         plain = scene_appearance(scene)
