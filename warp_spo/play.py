@@ -137,24 +137,16 @@ def checked(options: argparse.Namespace, chosen: Any) -> dict[str, str]:
     return {} if options.trial is None else {"trial": options.trial}
 
 
-def robot_file(chosen: Any) -> Path:
-    """Return the MJCF file of a task's ROBOT: that of a ready robot, or a path, which begins at the task's file."""
-    from .env import robots
-
-    robot = str(chosen.ROBOT)
-    return robots.FILES / f"{robot}.xml" if robot in robots.NAMES else Path(chosen.__file__).parent / robot
-
-
 def look_at(options: argparse.Namespace, chosen: Any, runner: Any, env: Any, policy: Any) -> None:
     """Write a page of the policy's motion, and let it act in a browser until Ctrl-C, as the arguments ask."""
     from .env import evaluation, learning
-    from .env.task_files import short_name
+    from .env.task_files import robot_file, short_name
     from .env.training_files import checkpoint_names
     from .viewing.appearance import file_appearance
     from .viewing.policy_view import Checkpoints, PolicyView
 
-    folder, file = options.checkpoint.parent, robot_file(chosen) if hasattr(chosen, "ROBOT") else None
-    appearance = None if file is None or not file.is_file() else file_appearance(file, env.scene)
+    folder, file = options.checkpoint.parent, robot_file(chosen)
+    appearance = None if file is None else file_appearance(file, env.scene)
 
     def load(name: str) -> Any:
         learning.load_checkpoint(runner, folder / name, learns=False)
@@ -176,12 +168,12 @@ def look_at(options: argparse.Namespace, chosen: Any, runner: Any, env: Any, pol
 
 def walk_in_mujoco(runner: Any, env: Any, name: str, chosen: Any, worlds: int = 64) -> dict[str, float]:
     """Return what :func:`warp_spo.mujoco.deployment.trial` measures of a policy, with the robot file of its task."""
-    from .env import export
+    from .env import export, task_files
     from .mujoco import deployment
 
     with tempfile.TemporaryDirectory() as folder:
         file, _ = export.save(runner, env, name, Path(folder) / "policy")
-        return deployment.trial(deployment.Deployment(file, robot_file(chosen), worlds))
+        return deployment.trial(deployment.Deployment(file, task_files.robot_file(chosen) or chosen.ROBOT, worlds))
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ python -m warp_spo.train go2-flat                         # into runs/go2-flat
 python -m warp_spo.train go2-flat --resume latest         # go on where it was stopped, by Ctrl-C or a crash
 python -m warp_spo.train go2-flat --resume runs/go2-flat/model_399.pt --iterations 800
 python -m warp_spo.train my_task.py --set learner.entropy=0.01 --set rewards.velocity=3 --set episode_length_s=10
+python -m warp_spo.train go2-flat --view                  # 64 of its worlds and its curves in a browser: needs viser
 python -m warp_spo.train go2-flat --gpus 4                # one process a GPU, each with --worlds worlds
 python -m warp_spo.train cartpole --gpus 2 --device cpu   # two processes on the CPU
 
@@ -63,12 +64,22 @@ def start(given: list[str]) -> int:
         "--logger", action="append", choices=("tensorboard", "wandb", "none"), dest="loggers",
         help="beside progress.jsonl; left out: tensorboard where it is installed; may be repeated",
     )  # fmt: skip
+    parser.add_argument("--view", action="store_true", help="show 64 worlds and curves in a browser while it trains")
+    parser.add_argument("--host", default="127.0.0.1", help="address that --view listens on")
+    parser.add_argument("--port", type=int, default=8080, help="the first that --view tries")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes", help=SET)
     parser.add_argument("--settings", type=Path, metavar="FILE.toml", help="such settings in a file")
     options = parser.parse_args(given)
     if int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) and options.resume is None:
         options.resume = Path("latest")  # torchrun has started anew what was killed
     load_learning(parser)
+    if options.view:
+        from .viewing.browser import load_viser
+
+        try:
+            load_viser()
+        except ImportError as error:
+            parser.error(str(error))
     from .env import settings, training_files
 
     try:
@@ -121,9 +132,12 @@ def learn(parser: Any, options: argparse.Namespace, chosen: Any, learner: Any, g
                "seed": options.seed, "save_interval": options.save_interval}  # fmt: skip
         if rank == 0:
             settings.write(folder, run, learner, options.given)
+        page = look_at(options, chosen, env, folder) if options.view and rank == 0 else None
     except (ValueError, OSError, ImportError) as error:
         parser.error(str(error))
     ending = learning.run(runner, iterations)
+    if page is not None:
+        page.close()
     if rank == 0:
         try:
             print(f"{folder}: checkpoints, progress.jsonl, {draw_curve(folder, name).name}")
@@ -135,6 +149,24 @@ def learn(parser: Any, options: argparse.Namespace, chosen: Any, learner: Any, g
             print(f"{folder}: {learning.describe_end(ending)}{again}", flush=True)
     learning.leave()
     return ending.status
+
+
+def look_at(options: argparse.Namespace, chosen: Any, env: Any, folder: Path) -> Any:
+    """Return the page of a training that is about to begin, after its address is printed."""
+    from .env.state_copies import StateCopies
+    from .env.task_files import robot_file, short_name
+    from .env.training_log import LiveRows
+    from .viewing.appearance import file_appearance
+    from .viewing.training_view import TrainingView
+
+    file = robot_file(chosen)
+    appearance = None if file is None else file_appearance(file, env.scene)
+    rows = LiveRows(folder / "progress.jsonl")
+    name, copies = short_name(options.task), StateCopies(env)
+    page = TrainingView(env.scene, copies, rows, env.default_q, name, appearance, options.host, options.port)
+    print(f"{name}: {page.page.url} shows {copies.worlds} worlds while it trains", flush=True)
+    page.start()
+    return page
 
 
 def continuation(given: list[str]) -> str:

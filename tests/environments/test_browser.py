@@ -1,4 +1,4 @@
-"""Pages driven in headless Chromium, as a user drives them: sliders, a push, pause, a checkpoint; no error in a console."""
+"""Pages driven in headless Chromium, as a user drives them; no error in their consoles."""
 
 import contextlib
 import shutil

@@ -117,13 +117,12 @@ def test_the_inertia_box_of_a_box_is_the_box():
     middles, turns, found = inertia_boxes(scene)
     assert np.allclose(middles, [[1, 2, 3]]) and np.allclose(np.sort(found[0]), np.sort(halves))
     axes = rotation(turns[0])
-    assert np.allclose(
-        axes @ np.diag(5.0 / 3.0 * (np.sum(found**2) - found[0] ** 2)) @ axes.T, turn @ np.diag(moments) @ turn.T
-    )
+    wanted, own = turn @ np.diag(moments) @ turn.T, 5.0 / 3.0 * (np.sum(found[0] ** 2) - found[0] ** 2)
+    assert np.allclose(axes @ np.diag(own) @ axes.T, wanted)
 
 
 def test_a_robot_falls_is_held_and_steps(leg):
-    """In the air its centre of mass falls as a stone does; pause holds, one step is one dt; forces rest on the ground."""
+    """In the air its centre of mass falls as a stone does; pause holds, a step is one dt; forces carry the weight."""
     _, page = leg
     page.back()
     page.tick()

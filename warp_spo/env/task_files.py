@@ -132,6 +132,18 @@ def build(chosen: Any, worlds: int, device: Any, seed: int, given: dict[str, Any
     return env
 
 
+def robot_file(chosen: Any) -> Path | None:
+    """Return the MJCF file of a task's ROBOT: that of a ready robot, or a path, which begins at the task's file.
+
+    None where the task names none, or there is no such file.
+    """
+    from . import robots
+
+    robot = str(getattr(chosen, "ROBOT", ""))
+    file = robots.FILES / f"{robot}.xml" if robot in robots.NAMES else Path(chosen.__file__).parent / robot
+    return file if file.is_file() else None
+
+
 def start_file(name: str) -> str:
     """Return the text of a file to start from: that of a ready task, with absolute imports and comments."""
     from .tasks import TASKS
