@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import shown
 from ..scene.scene import Scene
 from .shapes import primitives
-from .surfaces import Surface, merged, mesh_surface, primitive_surface, shape_surface
+from .surfaces import Triangles, merged, mesh_surface, primitive_surface, shape_surface
 
 GREY, COLLISION = (0.62, 0.66, 0.72), (0.95, 0.55, 0.12)
 LONGEST_NOTE = 400  # letters of what an importer says
@@ -27,8 +27,8 @@ class Appearance(NamedTuple):
         drawn: what the source draws. collision: its collision shapes. notes: what could not be drawn, in words.
     """
 
-    drawn: list[Surface]
-    collision: list[Surface]
+    drawn: list[Triangles]
+    collision: list[Triangles]
     notes: list[str]
 
 
@@ -131,8 +131,8 @@ def _newton_shapes(model: Any, rows: dict[int, int], unit: float) -> Appearance:
 
     kinds = {int(getattr(GeoType, kind.upper())): kind for kind in MJCF_KINDS.values()} | {int(GeoType.CONE): "cone"}
     kinds[int(GeoType.CONVEX_MESH)] = "mesh"
-    drawn: list[Surface] = []
-    collision: list[Surface] = []
+    drawn: list[Triangles] = []
+    collision: list[Triangles] = []
     lost: set[str] = set()
     if model.shape_count == 0:
         return Appearance([], [], [])

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..scene.ground import HeightField, Plane
-from .surfaces import Surface, field_surface
+from .surfaces import Triangles, field_surface
 
 HOST, PORT = "127.0.0.1", 8080
 SKY, SOIL, LINES = (236, 241, 246), (222, 226, 230), (204, 210, 216)  # colours of ground and of its lines
@@ -170,7 +170,7 @@ class BodyLayer:
     """
 
     def __init__(
-        self, page: Page, name: str, surfaces: Sequence[Surface], worlds: int = 1, opacity: float | None = None,
+        self, page: Page, name: str, surfaces: Sequence[Triangles], worlds: int = 1, opacity: float | None = None,
         visible: bool = True, clicked: Callable[[int], None] | None = None,
     ):  # fmt: skip
         self.worlds, self.handles = worlds, list[tuple[int, Any]]()

@@ -16,7 +16,7 @@ LENGTH = 300  # points of a curve
 REDRAWN = 0.25  # time from one picture of the curves to the next [s]
 
 
-class Curves:
+class CurveChart:
     """Curves by name over a common axis, of which the last points are shown.
 
     Args:

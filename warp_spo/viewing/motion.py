@@ -17,7 +17,7 @@ from ..status import Status
 
 GROUNDS = ("flat", "slope of 10 degrees", "rough", "stairs")
 PULL = 5.0  # rate at which what is pulled swings about the mouse [1/s]
-LONGEST = 400  # steps of one call of Motion.advance
+LONGEST = 400  # steps of one call of RobotMotion.advance
 
 
 def make_ground(name: str, own: Any) -> Any:
@@ -50,7 +50,7 @@ class Pull:
         return pose[:3] + rotation(pose[3:]) @ self.com
 
 
-class Motion:
+class RobotMotion:
     """One robot, stepped on the CPU in float64.
 
     Args:

@@ -15,7 +15,7 @@ from ..errors import shown
 from ..scene.ground import HeightField, Plane
 from .appearance import Appearance, scene_appearance
 from .browser import HOST, PORT, BodyLayer, Pace, Page
-from .curves import Bars, Curves, table
+from .curves import Bars, CurveChart, table
 from .pose import extent
 
 MOST_SHOWN, FIRST_SHOWN = 1024, 16  # worlds
@@ -115,9 +115,9 @@ class PolicyView:
         with tabs.add_tab("Rewards"):
             gui.add_markdown("Terms of the followed world, weighted, a second.")
             self.bars = Bars(gui)
-            self.reward = Curves(gui, "reward, mean of all worlds", ("reward",))
+            self.reward = CurveChart(gui, "reward, mean of all worlds", ("reward",))
             names = env.reward_names[:10]
-            self.terms = Curves(gui, "terms of the followed world", [shown(name) for name in names], 220)
+            self.terms = CurveChart(gui, "terms of the followed world", [shown(name) for name in names], 220)
         with tabs.add_tab("Ends"):
             self.ends = gui.add_markdown("")
         deeds = {"Pause": self.pause, "Step": self.step_once, "Reset": self.reset}

@@ -17,8 +17,8 @@ from ..scene.scene import Scene
 from ..status import Status
 from .appearance import Appearance, file_appearance, model_appearance, scene_appearance
 from .browser import HOST, PORT, WORLD, BodyLayer, Pace, Page
-from .curves import Curves
-from .motion import GROUNDS, Motion, Pull, make_ground
+from .curves import CurveChart
+from .motion import GROUNDS, Pull, RobotMotion, make_ground
 from .overlays import ORANGE, Arrows, Overlays, point_places
 from .pose import close, closed_pose, extent, first_pose, floats
 from .robot_text import describe_robot
@@ -64,7 +64,7 @@ class RobotView:
         self.size = max(float(np.linalg.norm(high - low)), 0.05)
         self.page = Page(title, host, port, self.size)
         self.page.look_from(self.size, float(0.5 * (low[2] + high[2])))
-        self.motion: Motion | None = None
+        self.motion: RobotMotion | None = None
         self.falls, self._steps_due, self._time_due = False, 0, 0.0
         self._pull: Pull | None = None
         self._grip: Any = None
@@ -111,8 +111,8 @@ class RobotView:
             self.numbers["speed"] = gui.add_slider("speed", 0.05, 2.0, 0.05, 1.0)
             self.boxes["hold"] = gui.add_checkbox("drives hold the pose", True)
             self.said = gui.add_markdown("Click a body to get a handle, and drag that with the mouse.")
-            self.energy = Curves(gui, "energy [J]", ("kinetic", "potential", "sum"))
-            self.statuses = Curves(gui, "status (0 is OK)", ("status",), height=110)
+            self.energy = CurveChart(gui, "energy [J]", ("kinetic", "potential", "sum"))
+            self.statuses = CurveChart(gui, "status (0 is OK)", ("status",), height=110)
         with tabs.add_tab("Text"):
             self.text = gui.add_markdown(describe_robot(self.scene, self.notes))
         deeds = {"Drop it": self.drop, "Pause": self.pause, "Step": self.step_once, "Back": self.back}
@@ -173,7 +173,7 @@ class RobotView:
             if scene.contacts and name != OWN:
                 scene = scene.with_contacts(scene.contacts, ground)
             self.said.content = "The time step is compiled, once for this robot and ground ..."
-            self.motion = Motion(scene)
+            self.motion = RobotMotion(scene)
             self.page.show_ground(ground if ground is not None else Plane())
         q = self.sliders.q.copy()
         if floats(self.scene):

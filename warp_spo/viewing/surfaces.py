@@ -20,7 +20,7 @@ BOX_FACES = np.array([
 FIELD_POINTS = 250_000  # of a height field that are drawn; of a larger one every second, third, ...
 
 
-class Surface(NamedTuple):
+class Triangles(NamedTuple):
     """Triangles of one colour, fixed to a body.
 
     Attributes:
@@ -35,7 +35,7 @@ class Surface(NamedTuple):
     flat: bool
 
 
-def shape_surface(kind: str, sizes: Any, pose: Any, body: int, color: Any) -> Surface:
+def shape_surface(kind: str, sizes: Any, pose: Any, body: int, color: Any) -> Triangles:
     """Return the surface of a shape whose axis is z.
 
     Args:
@@ -69,20 +69,20 @@ def shape_surface(kind: str, sizes: Any, pose: Any, body: int, color: Any) -> Su
     return mesh_surface(vertices * scale, faces, pose, body, color)._replace(flat=flat)
 
 
-def mesh_surface(vertices: Any, faces: Any, pose: Any, body: int, color: Any) -> Surface:
+def mesh_surface(vertices: Any, faces: Any, pose: Any, body: int, color: Any) -> Triangles:
     """Return the surface of a mesh at a pose [7] in the body frame."""
     pose = np.asarray(pose, np.float64)
     placed = np.asarray(vertices, np.float64) @ rotation(pose[3:]).T + pose[:3]
     tinted: Any = tuple(float(part) for part in color)
-    return Surface(int(body), placed.astype(np.float32), np.asarray(faces, np.int64).reshape(-1, 3), tinted, True)
+    return Triangles(int(body), placed.astype(np.float32), np.asarray(faces, np.int64).reshape(-1, 3), tinted, True)
 
 
-def primitive_surface(shape: Primitive) -> Surface:
+def primitive_surface(shape: Primitive) -> Triangles:
     """Return the surface of a primitive."""
     return shape_surface(shape.kind, shape.size, shape.pose, shape.body, shape.color)
 
 
-def field_surface(field: HeightField, which: int, color: Any) -> Surface:
+def field_surface(field: HeightField, which: int, color: Any) -> Triangles:
     """Return the surface of a height field, of number ``which`` of a set of them."""
     heights = field.heights if field.heights.ndim == 2 else field.heights[which]
     every = int(np.ceil(np.sqrt(heights.size / FIELD_POINTS)))
@@ -90,19 +90,19 @@ def field_surface(field: HeightField, which: int, color: Any) -> Surface:
     x, y = field.origin[0] + field.cells[0] * rows, field.origin[1] + field.cells[1] * columns
     z = heights[np.ix_(rows, columns)] + field.origin[2]
     vertices = np.stack([*np.meshgrid(x, y, indexing="ij"), z], axis=-1).reshape(-1, 3)
-    return Surface(-1, vertices.astype(np.float32), _grid_faces(*z.shape), tuple(color), True)
+    return Triangles(-1, vertices.astype(np.float32), _grid_faces(*z.shape), tuple(color), True)
 
 
-def merged(surfaces: Iterable[Surface]) -> list[Surface]:
+def merged(surfaces: Iterable[Triangles]) -> list[Triangles]:
     """Return the surfaces with those of one body, colour and shading in one."""
-    groups: dict[tuple, list[Surface]] = {}
+    groups: dict[tuple, list[Triangles]] = {}
     for surface in surfaces:
         groups.setdefault((surface.body, surface.color, surface.flat), []).append(surface)
     found = []
     for (body, color, flat), some in groups.items():
         starts = np.cumsum([0, *(len(each.vertices) for each in some)])[:-1]
         faces = np.concatenate([each.faces + start for each, start in zip(some, starts, strict=True)])
-        found.append(Surface(body, np.concatenate([each.vertices for each in some]), faces, color, flat))
+        found.append(Triangles(body, np.concatenate([each.vertices for each in some]), faces, color, flat))
     return found
 
 

@@ -15,7 +15,7 @@ from ..scene.ground import HeightField, Plane
 from ..scene.scene import Scene
 from .appearance import Appearance, scene_appearance
 from .browser import HOST, PORT, BodyLayer, Page
-from .curves import Bars, Curves
+from .curves import Bars, CurveChart
 from .policy_view import GAP
 from .pose import extent
 
@@ -63,7 +63,7 @@ class TrainingView:
         self._layer = BodyLayer(self.page, "worlds", self.appearance.drawn, copies.worlds)
         gui = self.page.gui
         self.said = gui.add_markdown("")
-        self.curves = {name: Curves(gui, words, (words,), 130, "iteration") for name, words in CURVES.items()}
+        self.curves = {name: CurveChart(gui, words, (words,), 130, "iteration") for name, words in CURVES.items()}
         self.bars = Bars(gui)
         self._seen, self._ended = 0, threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
