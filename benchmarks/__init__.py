@@ -17,9 +17,9 @@ Accuracy, mostly on a CPU:
 Contact:
     ``contact/``: times and errors, energy, every promised figure, other engines, gradients, terrain.
 Learning:
-    ``env_times`` (parts of a step of an environment), ``training`` (env-steps/s), ``learning_curves``, ``mdp/`` (do the
-    ready tasks compute what their pages say?), ``guard`` (trainings with numbers that are spoilt), ``killed_trainings``
-    (``kill -9`` and ``--resume latest``; a CPU).
+    ``env_times`` (parts of a step of an environment), ``training`` (env-steps/s), ``learning_curves``,
+    ``watched_training`` (the price of a page), ``mdp/`` (do the ready tasks compute what their pages say?), ``guard``
+    (trainings with numbers that are spoilt), ``killed_trainings`` (``kill -9`` and ``--resume latest``; a CPU).
 Documentation and refactoring:
     ``blocks`` (code of pages), ``site``, ``site_pictures``, ``gallery``; ``kernel_texts`` (generated),
     ``env_digests`` (bits of the tasks' environments).

@@ -61,7 +61,7 @@ class PolicyView:
         low, high = extent(self.appearance, self._all_poses()[0])
         self.size = max(float(np.linalg.norm(high - low)), 0.05)
         self.page = Page(title, host, port, self.size)
-        self.page.look_from(self.size, float(0.5 * (low[2] + high[2])))
+        self.page.look_from(self.size * (1.5 if env.num_envs > 1 else 1.0), float(0.5 * (low[2] + high[2])))
         ground = env.scene.ground
         self.page.show_ground(ground if ground is not None else Plane())
         self.is_field = isinstance(ground, HeightField)
@@ -250,7 +250,7 @@ class PolicyView:
         columns = math.ceil(math.sqrt(count))
         rows = np.arange(count)
         apart = 0.0 if self.is_field else GAP * self.size
-        self.offsets = np.stack([rows % columns, rows // columns, np.zeros(count)], axis=1) * apart
+        self.offsets = np.stack([-(rows % columns), rows // columns, np.zeros(count)], axis=1) * apart
         self._layer = BodyLayer(self.page, "worlds", self.appearance.drawn, count)
 
     def draw(self) -> None:
