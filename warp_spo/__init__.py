@@ -91,9 +91,11 @@ if not TYPE_CHECKING:  # or every misspelled name would pass a type checker
 
         if name in ("load", "from_newton"):  # these import newton
             return getattr(importlib.import_module(".newton", __name__), name)
+        if name == "view":
+            return importlib.import_module(".viewing.robot_view", __name__).view
         if name == "from_mujoco":
             return importlib.import_module(".mujoco", __name__).from_mujoco
-        if name in ("jax", "mujoco", "newton", "torch", "view"):
+        if name in ("jax", "mujoco", "newton", "torch"):
             return importlib.import_module(f".{name}", __name__)
         if name == "__version__":
             from importlib.metadata import PackageNotFoundError, version

@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 
@@ -86,17 +85,11 @@ def find_robot(name: str) -> Path:
     raise ValueError(f"robot {name!r} is unknown; expected one of {known}, or a URDF, MJCF or USD file")
 
 
-class CallableModule(ModuleType):
-    """This module, so that ``warp_spo.view`` is both the command and the function of that name."""
-
-    def __call__(self, robot: Any, *arguments: Any, **options: Any) -> Any:
-        """Return the page of a robot, see :func:`warp_spo.viewing.robot_view.view`."""
-        from .viewing.robot_view import view
-
-        return view(robot, *arguments, **options)
-
-
-sys.modules[__name__].__class__ = CallableModule
-
 if __name__ == "__main__":
     sys.exit(main())
+else:  # importing the command leaves warp_spo.view what it is, the function
+    from .viewing import robot_view
+
+    found: Any = robot_view.view
+    found.main = main
+    sys.modules[__name__] = found
