@@ -114,6 +114,7 @@ def test_a_policy_is_steered_pushed_held_and_exchanged_in_the_browser():
         q, qd = env.q.clone(), env.qd.clone()
         time.sleep(0.5)
         assert (env.q == q).all()
+        view.numbers["direction"].value = 0  # along the rail
         page.get_by_role("button", name="Push", exact=True).click()
         wait_until(lambda: (env.qd != qd).any())
         assert (env.q == q).all() and (env.qd[1:] == qd[1:]).all()
