@@ -48,6 +48,8 @@ SHOWN = (
     ("One tile of each kind of terrain", "terrain.png", "python -m benchmarks.contact.terrain terrain.png"),
 )
 """Title, file in ``docs/_static`` and command of pictures that other commands draw."""
+MOTIONS = {"ground.png": ("pages/go2_fall.html", "python -m warp_spo.view go2 --html go2_fall.html --seconds 3")}
+"""Picture -> the page in ``docs/_static`` with a time slider that a click on it opens, and its command."""
 OTHERS = """## Robots, policies, terrain
 
 Policies are trained by `python -m warp_spo.train TASK`: [training](training.md).
@@ -82,7 +84,14 @@ def main(names: list[str]) -> None:
     parts = [HEAD, OTHERS]
     for title, picture, command in SHOWN:
         mark = "<!-- not run: the page that it belongs to says when it was -->"
-        parts.append(f"### {title}\n\n{mark}\n```console\n{command}\n```\n\n![{title}](_static/{picture})\n")
+        shown = f"![{title}](_static/{picture})"
+        if picture in MOTIONS:
+            page, writes = MOTIONS[picture]
+            command, shown = (
+                f"{command}\n{writes}",
+                f"[{shown}](_static/{page})\n\nA click opens a motion with a time slider.",
+            )
+        parts.append(f"### {title}\n\n{mark}\n```console\n{command}\n```\n\n{shown}\n")
     PAGE.write_text("\n".join([*parts, *(sections[name].strip() + "\n" for name in known)]))
 
 

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from . import torch as torch
     from .mujoco import from_mujoco
     from .newton import from_newton, load
+    from .viewing.robot_view import view
 
     __version__: str
 
@@ -78,6 +79,7 @@ __all__ = [
     "normal_modes",
     "spline",
     "terrain",
+    "view",
     "where",
 ]
 
@@ -89,6 +91,8 @@ if not TYPE_CHECKING:  # or every misspelled name would pass a type checker
 
         if name in ("load", "from_newton"):  # these import newton
             return getattr(importlib.import_module(".newton", __name__), name)
+        if name == "view":
+            return importlib.import_module(".viewing.robot_view", __name__).view
         if name == "from_mujoco":
             return importlib.import_module(".mujoco", __name__).from_mujoco
         if name in ("jax", "mujoco", "newton", "torch"):

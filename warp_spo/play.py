@@ -2,13 +2,14 @@
 
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt                  # FILE.gif and FILE.png beside it
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --measure        # and errors over 256 worlds
-    python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --view           # in Newton's viewer, on a display
+    python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --view           # live, in a browser; no film
+    python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --html walk.html # one page with a time slider; no film
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --export policy  # policy.onnx, policy.pt, no film
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --minari go2/walk-v0 --episodes 500  # a data set
     python -m warp_spo.play go2-flat runs/go2-flat/model_399.pt --mujoco         # 64 robots walk in MuJoCo; no film
 
-With ``--export``, ``--minari`` or ``--mujoco`` a film is drawn only where ``--film`` or ``--view`` asks for it.
-Films are drawn without a display, on the device of the environment.
+With ``--export``, ``--minari``, ``--mujoco``, ``--view`` or ``--html`` a film is drawn only where ``--film`` asks for
+it. Films are drawn without a display, on the device of the environment.
 """
 
 from __future__ import annotations
@@ -50,8 +51,11 @@ def play(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, help="name of the film; left out: that of the checkpoint")
     parser.add_argument("--film", choices=("gif", "webp", "mp4"), help="gif unless told; mp4 needs imageio-ffmpeg")
     parser.add_argument("--measure", action="store_true", help="print what the task asks for, over --worlds worlds")
-    parser.add_argument("--worlds", type=count, default=256)
-    parser.add_argument("--view", action="store_true", help="show Newton's viewer")
+    parser.add_argument("--worlds", type=count, help="of --measure, 256 unless told, and of --view, 16")
+    parser.add_argument("--view", action="store_true", help="let it act in a browser, until Ctrl-C: needs viser")
+    parser.add_argument("--host", default="127.0.0.1", help="address that --view listens on")
+    parser.add_argument("--port", type=int, default=8080, help="the first that --view tries")
+    parser.add_argument("--html", type=Path, metavar="FILE", help="write --seconds of one world as a page: needs viser")
     parser.add_argument("--mujoco", action="store_true", help="let 64 robots walk in MuJoCo, on the CPU")
     parser.add_argument("--export", type=Path, help="write NAME.onnx and NAME.pt, TorchScript")
     parser.add_argument("--minari", metavar="ID", help="write a Minari data set of this name, such as go2/walk-v0")
@@ -66,7 +70,8 @@ def play(arguments: list[str] | None = None) -> int:
     from .viewing import films
 
     own = short_name(options.task)
-    worlds = options.worlds if options.measure or options.minari else 1
+    many = options.measure or options.minari
+    worlds = options.worlds or 256 if many else options.worlds or 16 if options.view else 1
     name = options.out or options.checkpoint.with_suffix("")
     try:
         chosen = task(options.task)
@@ -103,20 +108,20 @@ def play(arguments: list[str] | None = None) -> int:
         except (ValueError, OSError, ImportError) as error:
             parser.error(str(error))
         print(f"{options.minari}: {made.total_episodes} episodes, {made.total_steps} steps")
-    if options.film is None and (options.export or options.mujoco or options.minari) and not options.view:
-        return 0  # an export, a data set, or a run in MuJoCo, alone
+    if options.html or options.view:
+        try:
+            look_at(options, chosen, runner, env, policy)
+        except (ValueError, OSError) as error:
+            parser.error(str(error))
+    if options.film is None and any((options.export, options.minari, options.mujoco, options.view, options.html)):
+        return 0  # none of these needs a film
     suffix = f".{options.film or 'gif'}"
     if getattr(chosen, "ROBOT", None) not in robots.NAMES or not hasattr(chosen, "CAMERA"):
-        if options.view:
-            recorded = recording.record(env, policy, options.seconds, options.command)
-            recording.show(robot_file(chosen), recorded, env.step_dt)
         camera = getattr(chosen, "CAMERA", None)
         for file in recording.play(env, policy, name, options.seconds, options.command, camera, suffix):
             print(file)
         return 0
     recorded = recording.record(env, policy, options.seconds, options.command)
-    if options.view:
-        recording.show(robot_file(chosen), recorded, env.step_dt)
     frames = recording.film(chosen, recorded, recording.STEPS_A_PICTURE)
     print(films.save(frames, name.with_suffix(suffix), recording.STEPS_A_PICTURE * env.step_dt))
     strip = recording.strip(chosen, recorded)
@@ -140,35 +145,58 @@ def checked(options: argparse.Namespace, chosen: Any) -> dict[str, Any]:
     tracks = options.task not in TASKS or getattr(chosen, "ACTOR", [("",)])[0][0] == "base velocity"
     if options.mujoco and not tracks:  # of other tasks the exported file says it
         raise ValueError(f"--mujoco with {options.task}; expected a task that tracks velocities, such as go2-flat")
-    for asked, name in (options.view, "--view"), (options.mujoco, "--mujoco"):
-        if asked and not hasattr(chosen, "ROBOT"):
-            raise ValueError(f"{name} with {options.task}; expected a task with ROBOT, the path of its MJCF file")
-    for asked, module in (options.film == "mp4", "imageio_ffmpeg"), (options.view, "pyglet"):
-        if asked and importlib.util.find_spec(module) is None:
-            raise ImportError(f"{module} is missing; pip install {module.replace('_', '-')}")
-    for file in (options.out, options.export):
+    if options.mujoco and not hasattr(chosen, "ROBOT"):
+        raise ValueError(f"--mujoco with {options.task}; expected a task with ROBOT, the path of its MJCF file")
+    if options.film == "mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise ImportError("imageio_ffmpeg is missing; pip install imageio-ffmpeg")
+    if options.view or options.html:
+        from .viewing.browser import load_viser
+
+        load_viser()
+    for file in (options.out, options.export, options.html):
         if file is not None:
             file.parent.mkdir(parents=True, exist_ok=True)
     given: dict[str, Any] = {} if options.trial is None else {"trial": options.trial}
     return given | ({"final_observations": True} if options.minari else {})
 
 
-def robot_file(chosen: Any) -> Path:
-    """Return the MJCF file of a task's ROBOT: that of a ready robot, or a path, which begins at the task's file."""
-    from .env import robots
+def look_at(options: argparse.Namespace, chosen: Any, runner: Any, env: Any, policy: Any) -> None:
+    """Write a page of the policy's motion, and let it act in a browser until Ctrl-C, as the arguments ask."""
+    from .env import evaluation, learning
+    from .env.task_files import robot_file, short_name
+    from .env.training_files import checkpoint_names
+    from .viewing.appearance import file_appearance
+    from .viewing.policy_view import Checkpoints, PolicyView
 
-    robot = str(chosen.ROBOT)
-    return robots.FILES / f"{robot}.xml" if robot in robots.NAMES else Path(chosen.__file__).parent / robot
+    folder, file = options.checkpoint.parent, robot_file(chosen)
+    appearance = None if file is None else file_appearance(file, env.scene)
+
+    def load(name: str) -> Any:
+        learning.load_checkpoint(runner, folder / name, learns=False)
+        return learning.policy_of(runner)
+
+    checkpoints = Checkpoints(lambda: checkpoint_names(folder), load)
+    title, port = f"{short_name(options.task)}", options.port
+    page = PolicyView(env, policy, title, appearance, checkpoints, options.checkpoint.name, options.host, port)
+    with evaluation.hold(env, options.command):
+        if options.html:
+            options.html.write_text(page.as_html(options.seconds))
+            print(options.html)
+        if options.view:
+            print(f"{options.task}: {page.page.url} (Ctrl-C ends it)", flush=True)
+            page.run()
+        else:
+            page.close()
 
 
 def walk_in_mujoco(runner: Any, env: Any, name: str, chosen: Any, worlds: int = 64) -> dict[str, float]:
     """Return what :func:`warp_spo.mujoco.deployment.trial` measures of a policy, with the robot file of its task."""
-    from .env import export
+    from .env import export, task_files
     from .mujoco import deployment
 
     with tempfile.TemporaryDirectory() as folder:
         file, _ = export.save(runner, env, name, Path(folder) / "policy")
-        return deployment.trial(deployment.Deployment(file, robot_file(chosen), worlds))
+        return deployment.trial(deployment.Deployment(file, task_files.robot_file(chosen) or chosen.ROBOT, worlds))
 
 
 if __name__ == "__main__":

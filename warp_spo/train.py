@@ -7,6 +7,7 @@ python -m warp_spo.train go2-flat --resume latest         # go on where it was s
 python -m warp_spo.train go2-flat --resume runs/go2-flat/model_399.pt --iterations 800
 python -m warp_spo.train my_task.py --set learner.entropy=0.01 --set rewards.velocity=3 --set episode_length_s=10
 python -m warp_spo.train go2-flat --keep-failures         # worlds that fail leave files in runs/go2-flat/failures
+python -m warp_spo.train go2-flat --view                  # 64 of its worlds and its curves in a browser: needs viser
 python -m warp_spo.train go2-flat --gpus 4                # one process a GPU, each with --worlds worlds
 python -m warp_spo.train cartpole --gpus 2 --device cpu   # two processes on the CPU
 
@@ -72,6 +73,9 @@ def start(given: list[str]) -> int:
     )  # fmt: skip
     parser.add_argument("--precision", choices=PRECISIONS, help="of networks on a GPU; left out: tf32")
     parser.add_argument("--profile-start", action="store_true", help="print the seconds up to the first iteration")
+    parser.add_argument("--view", action="store_true", help="show 64 worlds and curves in a browser while it trains")
+    parser.add_argument("--host", default="127.0.0.1", help="address that --view listens on")
+    parser.add_argument("--port", type=int, default=8080, help="the first that --view tries")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes", help=SET)
     parser.add_argument("--settings", type=Path, metavar="FILE.toml", help="such settings in a file")
     options = parser.parse_args(given)
@@ -80,6 +84,13 @@ def start(given: list[str]) -> int:
     options.times = StartTimes(BEGAN)
     options.times.mark("Python and the command line")
     load_learning(parser, options.times.mark)
+    if options.view:
+        from .viewing.browser import load_viser
+
+        try:
+            load_viser()
+        except ImportError as error:
+            parser.error(str(error))
     from .env import settings, training_files
 
     if options.precision is not None:
@@ -142,6 +153,7 @@ def learn(parser: Any, options: argparse.Namespace, chosen: Any, learner: Any, g
                "seed": options.seed, "save_interval": options.save_interval}  # fmt: skip
         if rank == 0:
             settings.write(folder, run, learner, options.given)
+        page = look_at(options, chosen, runner, folder) if options.view and rank == 0 else None
     except (ValueError, OSError, ImportError) as error:
         parser.error(str(error))
     options.times.mark("networks and checkpoints")
@@ -150,6 +162,8 @@ def learn(parser: Any, options: argparse.Namespace, chosen: Any, learner: Any, g
     ending = learning.run(runner, iterations)
     for file in env.failure_files():
         print(f"{file}: {describe_failure(file)}", flush=True)
+    if page is not None:
+        page.close()
     if rank == 0:
         try:
             print(f"{folder}: checkpoints, progress.jsonl, {draw_curve(folder, name).name}")
@@ -171,6 +185,25 @@ def describe_failure(file: Path) -> str:
         return read(file).describe().splitlines()[0]
     except (OSError, ValueError) as error:
         return str(error)
+
+
+def look_at(options: argparse.Namespace, chosen: Any, runner: Any, folder: Path) -> Any:
+    """Return the page of a training that is about to begin, after its address is printed."""
+    from .env.state_copies import StateCopies
+    from .env.task_files import robot_file, short_name
+    from .env.training_log import LiveRows
+    from .viewing.appearance import file_appearance
+    from .viewing.training_view import TrainingView
+
+    env, file = runner.env, robot_file(chosen)
+    appearance = None if file is None else file_appearance(file, env.scene)
+    rows = LiveRows(folder / "progress.jsonl")
+    name, copies = short_name(options.task), StateCopies(env)
+    page = TrainingView(env.scene, copies, rows, env.default_q, name, appearance, options.host, options.port)
+    print(f"{name}: {page.page.url} shows {copies.worlds} worlds while it trains", flush=True)
+    runner.watchers.append(copies.copy)
+    page.start()
+    return page
 
 
 def continuation(given: list[str]) -> str:

@@ -367,18 +367,3 @@ def test_ants_are_paid_for_a_trot_of_all_legs():
         before, times = now, since
     for row in torch.cat(seen, dim=1):
         assert set(row.tolist()) >= {0.0, 2.0, 4.0}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", robots.NAMES)
-def test_newtons_viewer_gets_the_poses(name):
-    import newton
-
-    from warp_spo.viewing.viewer import Viewer
-
-    robot = robots.load(name)
-    viewer = Viewer(robot.path, newton.viewer.ViewerNull(num_frames=2))
-    q = robot.q + np.where(np.arange(len(robot.q)) > 7, 0.1, 0.0)
-    viewer.show(q)
-    wanted = spo.Dynamics(robot.scene, 1, "cpu", "float64").body_poses(q[None])[0]
-    assert np.allclose(viewer.state.body_q.numpy()[:, :3], wanted[:, :3], atol=1e-5)

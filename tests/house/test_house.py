@@ -43,6 +43,7 @@ ROOMS = (
     "tasks",
     "train",
     "play",
+    "view",
     "examples",
     "__main__",
 )

@@ -100,6 +100,11 @@ class Velocity:
         """How many numbers a command has."""
         return 3
 
+    @property
+    def ranges_by_name(self) -> dict[str, Range]:
+        """The range of each number, by name with its unit."""
+        return {"forward [m/s]": self.forward, "left [m/s]": self.left, "turn [rad/s]": self.turn}
+
     def draw(self, w: World, done: Condition | None) -> dict[str, Vector]:
         """Return a new command, and what belongs to it, by the name of the memory.
 
@@ -148,6 +153,11 @@ class Uniform:
     def size(self) -> int:
         """How many numbers a command has."""
         return len(self.ranges)
+
+    @property
+    def ranges_by_name(self) -> dict[str, Range]:
+        """The range of each number, by its place."""
+        return {f"command {i}": each for i, each in enumerate(self.ranges)}
 
     def draw(self, w: World, done: Condition | None) -> dict[str, Vector]:
         """Return a new command, by the name of the memory."""

@@ -264,6 +264,13 @@ class Env(VecEnv):
     def command(self, value: Any) -> None:
         self.command[:] = value
 
+    @property
+    def command_ranges(self) -> dict[str, tuple[float, float]]:
+        """Ranges of the numbers of a command by name; -1 to 1 for commands of one's own without ``ranges_by_name``."""
+        commands = self._layout.commands
+        plain = {f"command {i}": (-1.0, 1.0) for i in range(commands.size if self.has_commands else 0)}
+        return {name: (float(a), float(b)) for name, (a, b) in getattr(commands, "ranges_by_name", plain).items()}
+
     # -- stepping --------------------------------------------------------------------------------------------------
     def get_observations(self) -> Any:
         """Return the observations of the present state, a TensorDict of [world, number] by group."""

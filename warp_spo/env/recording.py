@@ -1,4 +1,4 @@
-"""Recordings of a policy: states of one world, drawn as pictures or shown in Newton's viewer."""
+"""Recordings of a policy: states of one world, drawn as pictures; and pages in which a policy acts."""
 
 from __future__ import annotations
 
@@ -156,17 +156,16 @@ def _draw(
     return films.pictures(scene, drawn, recorded.q[rows], camera, follow, beside, texts, recorded.device)
 
 
-def show(robot: str | Path, recorded: Rollout, step: float) -> None:
-    """Play a recording in Newton's viewer, in real time, again and again until its window is closed.
+def view(env: Env, policy: Any, **options: Any) -> Any:
+    """Return a page in a browser in which a policy acts in an environment; ``run()`` serves it until Ctrl-C.
 
-    ``robot``: one of ``robots.NAMES``, or a file of MJCF.
+    Args:
+        env: the environment. policy: function from observations to actions.
+        options: as :class:`warp_spo.viewing.policy_view.PolicyView` takes them: title, host, port, appearance.
+
+    Raises:
+        ImportError: viser is missing; the error names the extra ``view``.
     """
-    import time
+    from ..viewing.policy_view import PolicyView
 
-    from ..viewing.viewer import Viewer
-
-    viewer = Viewer(robots.FILES / f"{robot}.xml" if robot in robots.NAMES else Path(robot))
-    while viewer.is_running():
-        for q in recorded.q:
-            viewer.show(q, step)
-            time.sleep(step)
+    return PolicyView(env, policy, **options)

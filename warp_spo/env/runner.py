@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -79,6 +79,7 @@ class Runner(OnPolicyRunner):
     def __init__(self, env: Env, settings: dict[str, Any], device: str):
         super().__init__(env, settings, None, device=device)
         self.stop, self.unwritten = StopRequest(), dict[str, str]()
+        self.watchers: list[Callable[[], None]] = []  # called at the end of each iteration
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Learn for so many iterations, as rsl_rl does, with rollouts that may be one launch."""
@@ -118,6 +119,8 @@ class Runner(OnPolicyRunner):
         All processes of a training come here, and decide alike.
         """
         self.finished = iteration
+        for watch in self.watchers:
+            watch()
         log: Any = self.logger
         again = bool(self.unwritten) and iteration % log.every == 0
         asked = self.stop.signal or (signal.SIGTERM if is_orphan() else 0)

@@ -132,6 +132,18 @@ def build(chosen: Any, worlds: int, device: Any, seed: int, given: dict[str, Any
     return env
 
 
+def robot_file(chosen: Any) -> Path | None:
+    """Return the MJCF file of a task's ROBOT: that of a ready robot, or a path, which begins at the task's file.
+
+    None where the task names none, or there is no such file.
+    """
+    from . import robots
+
+    robot = str(getattr(chosen, "ROBOT", ""))
+    file = robots.FILES / f"{robot}.xml" if robot in robots.NAMES else Path(chosen.__file__).parent / robot
+    return file if file.is_file() else None
+
+
 def start_file(name: str) -> str:
     """Return the text of a file to start from: that of a ready task, with absolute imports and comments."""
     from .tasks import TASKS
@@ -155,7 +167,7 @@ HEADER = """\
 # A training needs build and LEARNER; all else may go.
 """
 COMMENTS = (
-    ("ROBOT = ", "# A ready robot, or the path of an MJCF file of yours, which play --view and --mujoco show.\n"),
+    ("ROBOT = ", "# A ready robot, or the path of an MJCF file of yours, which play --view draws and --mujoco runs.\n"),
     ("CAMERA = ", "# Where films are taken from.\n"),
     ("LEARNER = ", "# Settings of PPO: --set learner.NAME=VALUE changes one for a training.\n"),
     (

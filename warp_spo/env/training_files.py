@@ -120,6 +120,13 @@ def newest(folder: str | Path) -> Path | None:
     return best
 
 
+def checkpoint_names(folder: str | Path) -> list[str]:
+    """Return the names of a folder's checkpoints, fewest iterations first; ``last.pt`` only where there is no other."""
+    numbers = {file.name: re.fullmatch(r"model_(\d+)\.pt", file.name) for file in Path(folder).glob("model_*.pt")}
+    models = sorted((int(found[1]), name) for name, found in numbers.items() if found)
+    return [name for _, name in models] or [LAST] * (Path(folder) / LAST).is_file()
+
+
 def versions() -> dict[str, str]:
     """Return the versions of this package and of those that learn; "source" where it is not installed."""
     found = {}

@@ -243,3 +243,31 @@ def draw_curve(folder: str | Path, name: str) -> Path:
         figure.savefig(folder / "curve.png", dpi=110)
         pyplot.close(figure)
     return folder / "curve.png"
+
+
+class LiveRows:
+    """Rows of a ``progress.jsonl`` that is being written; calling it returns those that are whole.
+
+    Args:
+        file: which need not be there yet.
+    """
+
+    def __init__(self, file: Path):
+        self.file, self._rows, self._read = file, list[dict[str, float]](), 0
+
+    def __call__(self) -> list[dict[str, float]]:
+        """Return all rows so far; a file that has become shorter is read anew."""
+        try:
+            size = self.file.stat().st_size
+        except OSError:
+            return self._rows
+        if size < self._read:
+            self._rows, self._read = [], 0
+        if size > self._read:
+            with self.file.open("rb") as file:
+                file.seek(self._read)
+                text = file.read(size - self._read)
+            whole = text[: text.rfind(b"\n") + 1]
+            self._read += len(whole)
+            self._rows += [json.loads(line) for line in whole.splitlines() if line.strip()]
+        return self._rows

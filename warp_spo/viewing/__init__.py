@@ -1,4 +1,4 @@
-"""Pictures: films and strips of robots (``films``), charts of figures (``charts``), Newton's viewer (``viewer``)."""
+"""Pictures: films, strips of robots (``films``), charts (``charts``), pages of a browser (``robot_view``, ...)."""
 
 from .films import Camera, camera_of, pictures, save, save_strip
 from .shapes import Primitive, primitives
