@@ -101,11 +101,16 @@ class Contact(ShapeArguments):
 
     def placements(self, ground: Any) -> list[tuple[tuple[float, float, float], Support | None]]:
         """Return position and support of the points that touch a ground, as :class:`ContactPoint` has them."""
-        middle, _, moving = self.shape.supports(isinstance(ground, HeightField))
+        middle, _, moving = self.shape.supports()
+        found: list[tuple[tuple[float, float, float], Support | None]] = []
         if not moving or isinstance(ground, Listed):
-            return [((x, y, z), None) for x, y, z in self.positions.tolist()]
-        x, y, z = middle.tolist()
-        return [((x, y, z), support) for support in moving]
+            found += [((x, y, z), None) for x, y, z in self.positions.tolist()]
+        else:
+            found += [((*middle.tolist(),), support) for support in moving]
+        if isinstance(ground, HeightField):
+            middle, grid = self.shape.grid_supports()
+            found += [((*middle.tolist(),), support) for support in grid]
+        return found
 
 
 class ContactPoint(NamedTuple):
@@ -145,7 +150,7 @@ def contact_points(contacts: Sequence[Contact], ground: Any) -> tuple[ContactPoi
             contact.radius,
             contact.eps,
             contact.dissipation is not None,
-            contact.walls,
+            contact.walls and not (support and support.meets_grid),
             contact.damping is None and contact.dissipation is None,
             support,
         )

@@ -13,6 +13,10 @@ import numpy as np
 CORNER, RIM, SURFACE = "corner", "rim", "surface"
 """Corners of the face of a box that looks down; points on the rims of a cylinder or a cone; the lowest of an
 ellipsoid."""
+BOX_GRID, CAPSULE_GRID = "box grid", "capsule grid"
+"""Where a shape touches points and lines of a height field's grid, see :mod:`warp_spo.reference.field_grid`."""
+GRIDS = {BOX_GRID: ("box", 4), CAPSULE_GRID: ("capsule", 2)}
+"""The shape in the search for such places, and how many of them it has."""
 UPRIGHT = 1e-8  # square of the sine below which an axis is along the normal, and points on a rim keep their places
 SIDES = (-0.5, np.sqrt(0.75))  # cosine and sine of 120 degrees, from the lowest point of a rim to those beside it
 
@@ -21,7 +25,7 @@ class Support(NamedTuple):
     """A point that moves over a shape, about the shape's middle.
 
     Attributes:
-        kind: CORNER, RIM or SURFACE.
+        kind: CORNER, RIM, SURFACE, or one of GRIDS.
         axes: of the shape, in the body frame [3, 3], one a row.
         sizes: [m]. CORNER: half of the sizes. RIM: radius at the end of the third axis and at the other end, and half
             their distance. SURFACE: half of the axes.
@@ -40,10 +44,18 @@ class Support(NamedTuple):
         return (1.0 if self.number & 1 else -1.0), (1.0 if self.number & 2 else -1.0)
 
     @property
+    def meets_grid(self) -> bool:
+        """Whether it is where the shape touches the grid of a height field."""
+        return self.kind in GRIDS
+
+    @property
     def reach(self) -> float:
         """The largest distance from the middle [m]."""
         a, b, c = self.sizes
-        return {CORNER: np.hypot(np.hypot(a, b), c), RIM: np.hypot(max(a, b), c), SURFACE: max(a, b, c)}[self.kind]
+        if self.kind == CAPSULE_GRID:
+            return a + c
+        box = np.hypot(np.hypot(a, b), c)
+        return {RIM: np.hypot(max(a, b), c), SURFACE: max(a, b, c)}.get(self.kind, box)
 
     def offset(self, normal: Any) -> np.ndarray:
         """Return where the point is from the shape's middle [m]; ``normal`` of the ground and result in the body."""
@@ -55,6 +67,16 @@ def _corner(n: np.ndarray, half: np.ndarray, number: int) -> np.ndarray:
     face, signs = int(np.abs(n).argmax()), [1.0 if number & 1 else -1.0, 1.0 if number & 2 else -1.0]
     signs.insert(face, -1.0 if n[face] > 0.0 else 1.0)
     return np.array(signs) * half
+
+
+def _in_quadrant(n: np.ndarray, half: np.ndarray, number: int) -> np.ndarray:
+    """Return the middle of a quadrant of the face that looks down, which stands for places on a grid."""
+    face = int(np.abs(n).argmax())
+    return np.where(np.arange(3) == face, 1.0, 0.5) * _corner(n, half, number)
+
+
+def _on_axis(n: np.ndarray, sizes: np.ndarray, number: int) -> np.ndarray:
+    return np.array([0.0, 0.0, (number - 0.5) * sizes[2]])
 
 
 def _rim(n: np.ndarray, sizes: np.ndarray, number: int) -> np.ndarray:
@@ -74,4 +96,4 @@ def _lowest(n: np.ndarray, half: np.ndarray, number: int) -> np.ndarray:
     return -(half**2) * n / np.linalg.norm(half * n)
 
 
-OFFSETS = {CORNER: _corner, RIM: _rim, SURFACE: _lowest}
+OFFSETS = {CORNER: _corner, RIM: _rim, SURFACE: _lowest, BOX_GRID: _in_quadrant, CAPSULE_GRID: _on_axis}

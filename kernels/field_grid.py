@@ -1,0 +1,259 @@
+"""Where shapes touch the grid of a height field, as :mod:`warp_spo.reference.field_grid` says: loops over candidates.
+
+A search reads the table of cells, four corners each, and writes four rows of nine numbers. Its loops are not unrolled,
+so that their code is short however many points of the grid lie under a shape.
+"""
+
+import functools
+
+import warp as wp
+
+from .elementary import C_TYPE
+
+NAME = "grid_search"
+RULES = {
+    "OUTWARD": 1e-3, "TIE": 1e-6, "DOWN": 0.5, "ACROSS": 0.17, "BESIDE": 0.35, "SLACK": 0.5, "PARALLEL": 1e-6, "FAR": 1e30,
+}  # fmt: skip
+KINDS = {"QUADRANTS": 4, "POINT": 1, "LINE_Y": 2, "LINE_X": 3, "ROW": 9}
+
+
+@functools.cache
+def native(T: type) -> str:
+    """Return the definition of ``grid_search`` for scalars of type ``T``."""
+    text, number = NATIVE.replace("REAL", C_TYPE[T]).replace("LOOP\n", "#pragma unroll 1\n"), "f" * (T is wp.float32)
+    for name, value in RULES.items():
+        text = text.replace(name, f"{value!r}{number}")
+    for name, kind in KINDS.items():
+        text = text.replace(name, str(kind))
+    return text
+
+
+NATIVE = r"""
+struct grid_search
+{
+    // What a search reads: the first height, and numbers as the reference lists them.
+    struct Field
+    {
+        const REAL* cells;
+        const REAL *centre, *axes, *sizes;
+        REAL cell[2];
+        int count[2], low[2], high[2];
+
+        CUDA_CALLABLE inline Field(const REAL* table, const REAL* asked)
+            : centre(asked + 1), axes(asked + 4), sizes(asked + 13)
+        {
+            cells = table + 4ll * (int)asked[0];
+            for (int f = 0; f < 2; ++f) {
+                cell[f] = asked[16 + f];
+                count[f] = (int)asked[18 + f];
+            }
+        }
+
+        CUDA_CALLABLE inline REAL height(int i, int j) const { return cells[4ll * (i * count[1] + j)]; }
+
+        // From a grid point along y (f = 0) or x: by how much the line rises to the next one.
+        CUDA_CALLABLE inline REAL rises(int i, int j, int f) const
+        {
+            const REAL* at = cells + 4ll * (i * count[1] + j);
+            return at[1 + f] - at[0];
+        }
+
+        CUDA_CALLABLE inline REAL limited(REAL x, int f) const
+        {
+            const REAL most = count[f] - 1;
+            x = x > 0 ? x : 0;
+            return x < most ? x : most;
+        }
+
+        // The grid points between two places, or those of the cells around them.
+        CUDA_CALLABLE inline void between(REAL from, REAL to, int f, bool around, int& first, int& last) const
+        {
+            const REAL a = limited(from / cell[f], f), b = limited(to / cell[f], f);
+            first = (int)a, last = (int)b;
+            if (!around && first < a) ++first;
+            if (around && last < b) ++last;
+        }
+
+        // The axis k of the shape on the direction (x, y, z).
+        CUDA_CALLABLE inline REAL along(int k, REAL x, REAL y, REAL z) const
+        {
+            return axes[3 * k] * x + axes[3 * k + 1] * y + axes[3 * k + 2] * z;
+        }
+    };
+
+    struct Best
+    {
+        REAL* rows;
+        REAL score[QUADRANTS];
+
+        CUDA_CALLABLE inline Best(REAL* out) : rows(out)
+        {
+            for (int q = 0; q < QUADRANTS; ++q) score[q] = -FAR;
+            for (int n = 0; n < QUADRANTS * ROW; ++n) rows[n] = n % ROW == 3;
+        }
+
+        // The row to write for a candidate, or none.
+        CUDA_CALLABLE inline REAL* take(REAL depth, REAL u, REAL v)
+        {
+            const int q = (u > 0 ? 1 : 0) + (v > 0 ? 2 : 0);
+            const REAL found = depth + OUTWARD * (on::absolute(u) + on::absolute(v));
+            if (!(found > score[q] + TIE)) return nullptr;
+            score[q] = found;
+            return rows + ROW * q;
+        }
+    };
+
+    static CUDA_CALLABLE inline REAL least(REAL a, REAL b) { return a < b ? a : b; }
+
+    static CUDA_CALLABLE inline void box(const REAL* table, const REAL* asked, REAL* out)
+    {
+        Field field(table, asked);
+        Best best(out);
+        const REAL *c = field.centre, *A = field.axes, *half = field.sizes;
+        const REAL slack = SLACK * least(least(half[0], half[1]), half[2]);
+        int lowest = 0;
+        for (int k = 1; k < 3; ++k)
+            if (on::absolute(A[3 * k + 2]) > on::absolute(A[3 * lowest + 2])) lowest = k;
+        const int u = (lowest + 1) % 3, v = (lowest + 2) % 3;
+        for (int f = 0; f < 2; ++f) {
+            REAL reach = 0;
+            for (int k = 0; k < 3; ++k) reach += on::absolute(A[3 * k + f]) * half[k];
+            field.between(c[f] - reach, c[f] + reach, f, false, field.low[f], field.high[f]);
+        }
+        LOOP
+        for (int i = field.low[0]; i <= field.high[0]; ++i) {
+            LOOP
+            for (int j = field.low[1]; j <= field.high[1]; ++j) {
+                const REAL x = i * field.cell[0] - c[0], y = j * field.cell[1] - c[1], z = field.height(i, j) - c[2];
+                REAL q[3], inside[3], depth = FAR, side = 0;
+                for (int k = 0; k < 3; ++k) {
+                    q[k] = field.along(k, x, y, z);
+                    inside[k] = half[k] - on::absolute(q[k]);
+                }
+                int face = -1;
+                for (int k = 0; k < 3; ++k) {
+                    const REAL beside = least(inside[(k + 1) % 3], inside[(k + 2) % 3]);
+                    const REAL this_depth = half[k] + (A[3 * k + 2] > 0 ? q[k] : -q[k]);
+                    if (on::absolute(A[3 * k + 2]) >= DOWN && beside >= 0 && this_depth < depth)
+                        face = k, depth = this_depth, side = beside;
+                }
+                if (face < 0 || depth > side + slack) continue;
+                REAL* row = best.take(depth, u == 0 ? q[0] : u == 1 ? q[1] : q[2], v == 0 ? q[0] : v == 1 ? q[1] : q[2]);
+                if (!row) continue;
+                row[0] = POINT, row[1] = i, row[2] = j;
+                for (int k = 0; k < 3; ++k) {
+                    row[3 + k] = k == face ? (A[3 * k + 2] > 0 ? -1 : 1) : 0;
+                    row[6 + k] = row[3 + k] * half[k];
+                }
+            }
+        }
+        LOOP
+        for (int edge = 0; edge < 12; ++edge) {
+            const int k = edge / 4, first = (k + 1) % 3, second = (k + 2) % 3;
+            const REAL a = edge & 1 ? 1 : -1, b = edge & 2 ? 1 : -1;
+            if (!(least(a * A[3 * first + 2], b * A[3 * second + 2]) <= -DOWN)) continue;
+            const REAL p = a * half[first], r = b * half[second];
+            REAL at[3];
+            for (int x = 0; x < 3; ++x) at[x] = c[x] + p * A[3 * first + x] + r * A[3 * second + x];
+            LOOP
+            for (int f = 0; f < 2; ++f) {
+                const int o = 1 - f;
+                const REAL across = A[3 * k + f], aside = A[3 * k + o];
+                if (!(on::absolute(across) >= ACROSS)) continue;
+                const REAL wide = on::absolute(across) * half[k];
+                int line, last;
+                field.between(at[f] - wide, at[f] + wide, f, false, line, last);
+                LOOP
+                for (; line <= last; ++line) {
+                    const REAL t = (line * field.cell[f] - at[f]) / across;
+                    const REAL place = (at[o] + t * aside) / field.cell[o];
+                    if (on::absolute(t) > half[k] || !(place >= 0 && place <= field.count[o] - 1)) continue;
+                    const int m = (int)place < field.count[o] - 2 ? (int)place : field.count[o] - 2;
+                    const int i = f == 0 ? line : m, j = f == 0 ? m : line;
+                    const REAL rises = field.rises(i, j, f), rise = rises / field.cell[o];
+                    const REAL slope = (A[3 * k + 2] - aside * rise) / across;
+                    const REAL up = on::inverse_root(1 + rise * rise + slope * slope);
+                    const REAL nf = -slope * up, no = -rise * up, x = f == 0 ? nf : no, y = f == 0 ? no : nf;
+                    const REAL depth = (field.height(i, j) + (place - m) * rises - at[2] - t * A[3 * k + 2]) * up;
+                    const bool carries = a * field.along(first, x, y, up) <= BESIDE
+                        && b * field.along(second, x, y, up) <= BESIDE;
+                    if (!carries || on::absolute(rise) > 1 || up < DOWN
+                        || depth > half[k] - on::absolute(t) + slack) continue;
+                    REAL* row = best.take(depth, u == k ? t : u == first ? p : r, v == k ? t : v == first ? p : r);
+                    if (!row) continue;
+                    row[0] = f == 0 ? LINE_Y : LINE_X, row[1] = i, row[2] = j;
+                    for (int x = 0; x < 3; ++x) {
+                        row[3 + x] = x == k;
+                        row[6 + x] = x == first ? p : x == second ? r : 0;
+                    }
+                }
+            }
+        }
+    }
+
+    static CUDA_CALLABLE inline void capsule(const REAL* table, const REAL* asked, REAL* out)
+    {
+        Field field(table, asked);
+        Best best(out);
+        const REAL *c = field.centre, *axis = field.axes + 6;
+        const REAL radius = field.sizes[0], half = field.sizes[2];
+        for (int f = 0; f < 2; ++f) {
+            const REAL reach = on::absolute(axis[f]) * half + radius;
+            field.between(c[f] - reach, c[f] + reach, f, true, field.low[f], field.high[f]);
+        }
+        LOOP
+        for (int i = field.low[0]; i <= field.high[0]; ++i) {
+            LOOP
+            for (int j = field.low[1]; j <= field.high[1]; ++j) {
+                const REAL w[3] = {c[0] - i * field.cell[0], c[1] - j * field.cell[1], c[2] - field.height(i, j)};
+                const REAL along = field.along(2, w[0], w[1], w[2]);
+                LOOP
+                for (int f = -1; f < 2; ++f) { // the grid point, its line along y, its line along x
+                    REAL t = -along, s = 0, g[3] = {0, 0, 0};
+                    if (f >= 0) {
+                        const int o = 1 - f;
+                        if ((f == 0 ? j : i) + 1 >= field.count[o]) continue;
+                        g[0] = f == 0 ? 0 : field.cell[0], g[1] = f == 0 ? field.cell[1] : 0;
+                        g[2] = field.rises(i, j, f);
+                        const REAL square = g[0] * g[0] + g[1] * g[1] + g[2] * g[2];
+                        const REAL both = field.along(2, g[0], g[1], g[2]);
+                        const REAL of_line = g[0] * w[0] + g[1] * w[1] + g[2] * w[2];
+                        const REAL spread = square - both * both;
+                        if (!(spread > PARALLEL * square)) continue;
+                        t = (both * of_line - square * along) / spread;
+                        s = (of_line + both * t) / square;
+                        if (!(s >= 0 && s <= 1)) continue;
+                    }
+                    if (!(on::absolute(t) < half)) continue;
+                    REAL away[3], squares = 0;
+                    for (int x = 0; x < 3; ++x) {
+                        away[x] = w[x] + t * axis[x] - s * g[x];
+                        squares += away[x] * away[x];
+                    }
+                    const REAL z = c[2] + t * axis[2];
+                    const bool outside = surface(field, c[0] + t * axis[0], c[1] + t * axis[1]) <= z;
+                    if (outside && !(away[2] > 0)) continue;
+                    REAL* row = best.take(-on::sqrt(squares), t, 0);
+                    if (!row) continue;
+                    row[0] = f < 0 ? POINT : f == 0 ? LINE_Y : LINE_X, row[1] = i, row[2] = j;
+                    row[3] = outside ? 1 : -1;
+                }
+            }
+        }
+    }
+
+    // The height of the field at a place.
+    static CUDA_CALLABLE inline REAL surface(const Field& field, REAL x, REAL y)
+    {
+        REAL part[2] = {field.limited(x / field.cell[0], 0), field.limited(y / field.cell[1], 1)};
+        int at[2];
+        for (int f = 0; f < 2; ++f) {
+            at[f] = (int)part[f] < field.count[f] - 2 ? (int)part[f] : field.count[f] - 2;
+            part[f] -= at[f];
+        }
+        const REAL* h = field.cells + 4ll * (at[0] * field.count[1] + at[1]);
+        const REAL low = h[0] + part[1] * (h[1] - h[0]), high = h[2] + part[1] * (h[3] - h[2]);
+        return low + part[0] * (high - low);
+    }
+};
+"""

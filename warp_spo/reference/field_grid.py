@@ -1,0 +1,199 @@
+"""The specification of where shapes touch the grid of a height field: its points, and its lines between them.
+
+A box touches grid points under its faces that look down, along the face's normal, and grid lines where they cross its
+edges, along the normal of both. A capsule touches a point or a line where that is nearest to its axis. Each candidate
+has a depth, negative outside. The deepest of each quadrant of the shape are rows of their own: of two the first found
+counts, unless the other is deeper by more than TIE, where being farther out counts as deeper by OUTWARD of that.
+
+What is found is discrete: which point or line, and which face or edge. Where it lies follows from the pose and heights.
+"""
+
+import numpy as np
+
+ROW = 9  # numbers of a row: its kind, i, j of a grid point, a direction and a place on the shape, in its axes
+NONE, POINT, LINE_Y, LINE_X = 0.0, 1.0, 2.0, 3.0  # kinds: a grid point; from there a line along y, or along x
+QUADRANTS = 4
+OUTWARD, TIE = 1e-3, 1e-6  # share of the distance from the middle that counts as depth; what is as deep [m]
+DOWN = 0.5  # by how much a face or an edge looks down at least: the cosine of 60 degrees
+ACROSS = 0.17  # sine of the angle between an edge and a grid line, seen from above, at least
+BESIDE = 0.35  # cosine of the angle between a face's normal and the ground's below which its edges may carry
+SLACK = 0.5  # share of half the smallest size by which a depth may exceed the way out to the side
+PARALLEL = 1e-6  # square of the sine below which an axis and a grid line are parallel
+
+
+def find(shape, heights, numbers):
+    """Return the rows [QUADRANTS, ROW] of a shape: "box" or "capsule".
+
+    Args:
+        heights: of all fields, row after row. numbers: of the first height of the field; the shape's middle from there
+            (3) [m]; its axes, one a row (9); its sizes (3) [m]; the cell along x and y [m]; points along x and y.
+    """
+    first, centre, axes, sizes, cell, counts = np.split(np.asarray(numbers, dtype=np.float64), [1, 4, 13, 16, 18])
+    counts = counts.astype(int)
+    field = heights[int(first[0]) :][: counts[0] * counts[1]].reshape(counts)
+    return SHAPES[shape](field, cell, centre, axes.reshape(3, 3), sizes)
+
+
+def _choose(candidates):
+    """Return the rows of the best of (depth, u, v, row)."""
+    rows, best = np.zeros((QUADRANTS, ROW)), np.full(QUADRANTS, -np.inf)
+    rows[:, 3] = 1.0
+    for depth, u, v, row in candidates:
+        quadrant, score = (u > 0.0) + 2 * (v > 0.0), depth + OUTWARD * (abs(u) + abs(v))
+        if score > best[quadrant] + TIE:
+            rows[quadrant], best[quadrant] = row, score
+    return rows
+
+
+def _between(low, high, cell, count):
+    """Return the first and the last grid point between two places, and where the cells around them end."""
+    most = count - 1.0
+    low, high = (np.clip(x / cell, 0.0, most) if np.isfinite(x) else 0.0 for x in (low, high))
+    return int(np.ceil(low)), int(np.floor(high)), int(np.floor(low)), int(np.ceil(high))
+
+
+def _box(field, cell, centre, axes, half):
+    reach = np.abs(axes.T) @ half
+    ranges = [_between(centre[f] - reach[f], centre[f] + reach[f], cell[f], field.shape[f]) for f in (0, 1)]
+    down = np.where(axes[:, 2] > 0.0, -1.0, 1.0)  # the side of each axis that looks down
+    looks = np.abs(axes[:, 2]) >= DOWN
+    lowest = int(np.abs(axes[:, 2]).argmax())
+    u, v = (lowest + 1) % 3, (lowest + 2) % 3
+    slack = SLACK * half.min()
+    found = []
+    for i in range(ranges[0][0], ranges[0][1] + 1):
+        for j in range(ranges[1][0], ranges[1][1] + 1):
+            q = axes @ (np.array([i * cell[0], j * cell[1], field[i, j]]) - centre)
+            inside = half - np.abs(q)
+            face, depth = -1, np.inf
+            for k in range(3):
+                if looks[k] and min(inside[(k + 1) % 3], inside[(k + 2) % 3]) >= 0.0:
+                    this = half[k] - down[k] * q[k]
+                    face, depth = (k, this) if this < depth else (face, depth)
+            if face >= 0 and depth <= min(inside[(face + 1) % 3], inside[(face + 2) % 3]) + slack:
+                out = down[face] * np.eye(3)[face]
+                found.append((depth, q[u], q[v], [POINT, i, j, *out, *(half * out)]))
+    for k in range(3):
+        first, second = (k + 1) % 3, (k + 2) % 3
+        for b, a in ((b, a) for b in (-1.0, 1.0) for a in (-1.0, 1.0)):
+            if not min(a * axes[first, 2], b * axes[second, 2]) <= -DOWN:
+                continue
+            seat = a * half[first] * np.eye(3)[first] + b * half[second] * np.eye(3)[second]
+            at, along = centre + axes.T @ seat, axes[k]
+            for f in (0, 1):
+                found += _crossings(field, cell, at, along, f, half, k, (first, a, second, b), axes, seat, slack, u, v)
+    return _choose(found)
+
+
+def _crossings(field, cell, at, along, f, half, k, faces, axes, seat, slack, u, v):
+    """Return the candidates where lines at constant x (``f`` 0) or y cross an edge."""
+    o, across, found = 1 - f, along[f], []
+    if not abs(across) >= ACROSS:
+        return found
+    first, a, second, b = faces
+    wide = abs(across) * half[k]
+    begin, end, *_ = _between(at[f] - wide, at[f] + wide, cell[f], field.shape[f])
+    for line in range(begin, end + 1):
+        t = (line * cell[f] - at[f]) / across
+        place = (at[o] + t * along[o]) / cell[o]
+        if abs(t) > half[k] or not 0.0 <= place <= field.shape[o] - 1.0:
+            continue
+        m = min(int(place), field.shape[o] - 2)
+        i, j = (line, m) if f == 0 else (m, line)
+        rises = field[i, j + 1] - field[i, j] if f == 0 else field[i + 1, j] - field[i, j]
+        rise = rises / cell[o]
+        slope = (along[2] - along[o] * rise) / across
+        up = 1.0 / np.sqrt(1.0 + rise * rise + slope * slope)
+        n = np.array([0.0, 0.0, up])
+        n[f], n[o] = -slope * up, -rise * up
+        depth = (field[i, j] + (place - m) * rises - at[2] - t * along[2]) * up
+        carries = a * (axes[first] @ n) <= BESIDE and b * (axes[second] @ n) <= BESIDE
+        if abs(rise) <= 1.0 and up >= DOWN and carries and depth <= half[k] - abs(t) + slack:
+            q = seat + t * np.eye(3)[k]
+            found.append((depth, q[u], q[v], [LINE_Y if f == 0 else LINE_X, i, j, *np.eye(3)[k], *seat]))
+    return found
+
+
+def _capsule(field, cell, centre, axes, sizes):
+    radius, _, half = sizes
+    axis, found = axes[2], []
+    reach = np.abs(axis[:2]) * half + radius
+    ranges = [_between(centre[f] - reach[f], centre[f] + reach[f], cell[f], field.shape[f]) for f in (0, 1)]
+    for i in range(ranges[0][2], ranges[0][3] + 1):
+        for j in range(ranges[1][2], ranges[1][3] + 1):
+            corner = np.array([i * cell[0], j * cell[1], field[i, j]])
+            w = centre - corner
+            along = axis @ w
+            found.append((-along, w - along * axis, POINT, i, j))
+            for f in (0, 1):
+                o = 1 - f
+                if (j, i)[f] + 1 >= field.shape[o]:
+                    continue
+                rises = field[i, j + 1] - field[i, j] if f == 0 else field[i + 1, j] - field[i, j]
+                g = np.array([0.0, 0.0, rises])
+                g[o] = cell[o]
+                square, both, of_line = g @ g, axis @ g, g @ w
+                spread = square - both * both
+                if not spread > PARALLEL * square:
+                    continue
+                t = (both * of_line - square * along) / spread
+                s = (of_line + both * t) / square
+                if 0.0 <= s <= 1.0:
+                    found.append((t, w + t * axis - s * g, LINE_Y if f == 0 else LINE_X, i, j))
+    rows = []
+    for t, away, kind, i, j in found:
+        distance = np.sqrt(away @ away)
+        if abs(t) < half:
+            outside = _height(field, cell, centre + t * axis) <= (centre + t * axis)[2]
+            if not outside or away[2] > 0.0:
+                rows.append((-distance, t, 0.0, [kind, i, j, 1.0 if outside else -1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    return _choose(rows)
+
+
+def _height(field, cell, at):
+    """Return the height of the field at a place [m]."""
+    x, y = (np.clip(at[f] / cell[f], 0.0, field.shape[f] - 1.0) for f in (0, 1))
+    i, j = (min(int(p), field.shape[f] - 2) for f, p in enumerate((x, y)))
+    s, t = x - i, y - j
+    return np.array([1.0 - s, s]) @ field[i : i + 2, j : j + 2] @ np.array([1.0 - t, t])
+
+
+SHAPES = {"box": _box, "capsule": _capsule}
+
+
+def touched(shape, field, cell, centre, axes, sizes, radius, row):
+    """Return normal, depth and place on the shape of a row of :func:`find`; None: it touches nothing.
+
+    Args:
+        field: heights [i, j]. centre: of the shape, from the field's first point. axes: of the shape, one a row, as
+            ``field`` in inertial axes. radius: by which the shape is larger [m].
+    """
+    kind, i, j = row[0], int(row[1]), int(row[2])
+    if kind == NONE:
+        return None
+    corner = np.array([i * cell[0], j * cell[1], field[i, j]])
+    g = np.array([0.0, 0.0, 0.0])
+    if kind != POINT:
+        f = 0 if kind == LINE_Y else 1
+        g[1 - f], g[2] = cell[1 - f], (field[i, j + 1] if f == 0 else field[i + 1, j]) - field[i, j]
+    if shape == "capsule":
+        w, axis = centre - corner, axes[2]
+        t, s = -(axis @ w), 0.0
+        if kind != POINT:
+            both, square = axis @ g, g @ g
+            t = (both * (g @ w) - square * (axis @ w)) / (square - both * both)
+            s = (g @ w + both * t) / square
+        away = w + t * axis - s * g
+        distance = row[3] * np.linalg.norm(away)
+        n = away / distance
+        return n, sizes[0] - distance, centre + t * axis - sizes[0] * n
+    out, at = axes.T @ row[3:6], centre + axes.T @ row[6:9]
+    if kind == POINT:
+        depth = out @ (at - corner)
+        return -out, depth + radius, corner + depth * out + radius * out
+    t = (corner[f] - at[f]) / out[f]
+    at = at + t * out
+    n = np.cross(out, g)
+    n *= np.sign(n[2]) / np.linalg.norm(n)
+    height = corner[2] + (at[1 - f] - corner[1 - f]) / cell[1 - f] * g[2]
+    return n, (height - at[2]) * n[2] + radius, at - radius * n
