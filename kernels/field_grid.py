@@ -12,9 +12,15 @@ from .elementary import C_TYPE
 
 NAME = "grid_search"
 RULES = {
-    "OUTWARD": 1e-3, "TIE": 1e-6, "DOWN": 0.5, "ACROSS": 0.17, "BESIDE": 0.35, "SLACK": 0.5, "PARALLEL": 1e-6, "FAR": 1e30,
+    "OUTWARD": 1e-3, "TIE": 1e-6, "DOWN": 0.5, "ACROSS": 0.17, "BESIDE": 0.35, "SLACK": 0.5, "PARALLEL": 1e-6,
+    "FAR": 1e30,
 }  # fmt: skip
 KINDS = {"QUADRANTS": 4, "POINT": 1, "LINE_Y": 2, "LINE_X": 3, "ROW": 9}
+
+
+def definitions(code: str, T: type) -> list[str]:
+    """Return the definition of ``grid_search`` if the C++ text ``code`` uses it."""
+    return [native(T)] if NAME in code else []
 
 
 @functools.cache
@@ -138,7 +144,9 @@ struct grid_search
                         face = k, depth = this_depth, side = beside;
                 }
                 if (face < 0 || depth > side + slack) continue;
-                REAL* row = best.take(depth, u == 0 ? q[0] : u == 1 ? q[1] : q[2], v == 0 ? q[0] : v == 1 ? q[1] : q[2]);
+                const REAL along_u = u == 0 ? q[0] : u == 1 ? q[1] : q[2];
+                const REAL along_v = v == 0 ? q[0] : v == 1 ? q[1] : q[2];
+                REAL* row = best.take(depth, along_u, along_v);
                 if (!row) continue;
                 row[0] = POINT, row[1] = i, row[2] = j;
                 for (int k = 0; k < 3; ++k) {

@@ -134,6 +134,11 @@ class ContactPoint(NamedTuple):
     is_slow: bool = False
     support: Support | None = None
 
+    @property
+    def meets_grid(self) -> bool:
+        """Whether it is where its shape touches the grid of a height field, beside the shape's other points."""
+        return self.support is not None and self.support.meets_grid
+
     def place(self, normal: Any) -> np.ndarray:
         """Return where the point is, or the centre of its sphere, in the body frame [m]; ``normal`` of the ground."""
         position = np.asarray(self.position)
@@ -150,7 +155,7 @@ def contact_points(contacts: Sequence[Contact], ground: Any) -> tuple[ContactPoi
             contact.radius,
             contact.eps,
             contact.dissipation is not None,
-            contact.walls and not (support and support.meets_grid),
+            contact.walls and not (support is not None and support.meets_grid),
             contact.damping is None and contact.dissipation is None,
             support,
         )

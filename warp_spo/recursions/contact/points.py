@@ -191,7 +191,7 @@ def place_points(
         lever = radius + total(absolute(x) for x in centre)
         hub, more = centre, None
         grid: Touch | None = None
-        if point.support is not None and point.support.meets_grid:
+        if point.meets_grid:
             assert isinstance(ground, HeightField)
             if point.contact not in searches:
                 at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
