@@ -205,7 +205,13 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
     """Return the native code of one thread, given its statements for CUDA and for the CPU."""
     c = C_TYPE[T]
     numbers = [f"const {c} {name}_row[1] = {{{name}}};" for name in layout.numbers]
-    text = [NATIVE[c], *field_grid.definitions(cpu, T), *numbers, "#if defined(__CUDA_ARCH__)", *_cuda_text(layout, cuda, T)]
+    text = [
+        NATIVE[c],
+        *field_grid.definitions(cpu, T),
+        *numbers,
+        "#if defined(__CUDA_ARCH__)",
+        *_cuda_text(layout, cuda, T),
+    ]
     text += ["#else", *_cpu_text(layout, cpu, c), "#endif", "#undef SENT", "#undef RELAY"]
     return "\n".join([*text, *(["#undef FIELD"] if layout.fields else []), ""])
 
