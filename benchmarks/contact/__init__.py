@@ -5,6 +5,7 @@
 ``spinning_contacts``: torsional and rolling friction beside closed forms and MuJoCo, on a CPU.
 ``motions`` and ``courses``: every figure that contacts promise, on a CPU. ``mujoco``: G1 beside MuJoCo, its error
 against run time. ``peers``: steps beside mujoco_warp and Newton's solvers, on a GPU. ``gradients``: their time, errors
-and jumps. ``terrain``: a picture of the kinds of terrain. ``shapes``: shapes on fields and planes beside truths. All
-but ``scenes`` and ``courses`` are commands.
+and jumps. ``terrain``: a picture of the kinds of terrain. ``shapes``: shapes on fields and planes beside truths.
+``uneven``: boxes and capsules on fields beside dense sampling, on a stair's edge and across a ridge. All but
+``scenes`` and ``courses`` are commands.
 """

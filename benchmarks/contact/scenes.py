@@ -1,7 +1,8 @@
 """Robots on the ground, and states in which they stand: Go2, G1 and an ant, on a plane or rough ground.
 
-Go2 has a sphere at each foot and a box at the trunk; G1 four points at each sole and ten points on its body. "go2_boxes"
-and "g1_boxes" have a box at each foot, and nothing else. The ant is that of the tasks, with its capsules. Drives hold the joints with effort limits.
+Go2 has a sphere at each foot and a box at the trunk; G1 four points at each sole and ten points on its body. With
+"_boxes" after their names they have a box at each foot, and nothing else. The ant is that of the tasks, with its
+capsules. Drives hold the joints with effort limits.
 """
 
 from __future__ import annotations
