@@ -111,91 +111,172 @@ struct grid_search
 
     static CUDA_CALLABLE inline REAL least(REAL a, REAL b) { return a < b ? a : b; }
 
+    // What looks for a polyhedron's points and edges on the grid.
+    struct Polyhedron
+    {
+        Field field;
+        Best best;
+        REAL slack;
+        int u, v;
+
+        CUDA_CALLABLE inline Polyhedron(const REAL* table, const REAL* asked, REAL* out) : field(table, asked), best(out)
+        {
+            const REAL *c = field.centre, *A = field.axes, *half = field.sizes;
+            slack = SLACK * least(least(half[0], half[1]), half[2]);
+            int lowest = 0;
+            for (int k = 1; k < 3; ++k)
+                if (on::absolute(A[3 * k + 2]) > on::absolute(A[3 * lowest + 2])) lowest = k;
+            u = (lowest + 1) % 3, v = (lowest + 2) % 3;
+            for (int f = 0; f < 2; ++f) {
+                REAL reach = 0;
+                for (int k = 0; k < 3; ++k) reach += on::absolute(A[3 * k + f]) * half[k];
+                field.between(c[f] - reach, c[f] + reach, f, false, field.low[f], field.high[f]);
+            }
+        }
+
+        // The grid point (i, j) from the middle, in the axes of the shape.
+        CUDA_CALLABLE inline void from_middle(int i, int j, REAL* q) const
+        {
+            const REAL* c = field.centre;
+            const REAL x = i * field.cell[0] - c[0], y = j * field.cell[1] - c[1], z = field.height(i, j) - c[2];
+            for (int k = 0; k < 3; ++k) q[k] = field.along(k, x, y, z);
+        }
+
+        CUDA_CALLABLE inline void take_point(int i, int j, const REAL* q, REAL depth, REAL side,
+                                             const REAL* out, REAL offset)
+        {
+            if (!(side >= 0 && depth <= side + slack)) return;
+            REAL* row = best.take(depth, q[u], q[v]);
+            if (!row) return;
+            row[0] = POINT, row[1] = i, row[2] = j;
+            for (int k = 0; k < 3; ++k) row[3 + k] = out[k], row[6 + k] = offset * out[k];
+        }
+
+        // An edge about ``seat`` along ``local``, between faces with the normals ``first`` and ``second``.
+        CUDA_CALLABLE inline void cross(const REAL* seat, const REAL* local, REAL half, const REAL* first,
+                                        const REAL* second)
+        {
+            const REAL *c = field.centre, *A = field.axes;
+            REAL at[3], along[3], one[3], other[3];
+            for (int x = 0; x < 3; ++x) {
+                at[x] = c[x] + seat[0] * A[x] + seat[1] * A[3 + x] + seat[2] * A[6 + x];
+                along[x] = local[0] * A[x] + local[1] * A[3 + x] + local[2] * A[6 + x];
+                one[x] = first[0] * A[x] + first[1] * A[3 + x] + first[2] * A[6 + x];
+                other[x] = second[0] * A[x] + second[1] * A[3 + x] + second[2] * A[6 + x];
+            }
+            if (!(least(one[2], other[2]) <= -DOWN)) return;
+            LOOP
+            for (int f = 0; f < 2; ++f) {
+                const int o = 1 - f;
+                const REAL across = f == 0 ? along[0] : along[1], aside = f == 0 ? along[1] : along[0];
+                const REAL at_f = f == 0 ? at[0] : at[1], at_o = f == 0 ? at[1] : at[0];
+                if (!(on::absolute(across) >= ACROSS)) continue;
+                const REAL wide = on::absolute(across) * half;
+                int line, last;
+                field.between(at_f - wide, at_f + wide, f, false, line, last);
+                LOOP
+                for (; line <= last; ++line) {
+                    const REAL t = (line * field.cell[f] - at_f) / across;
+                    const REAL place = (at_o + t * aside) / field.cell[o];
+                    if (on::absolute(t) > half || !(place >= 0 && place <= field.count[o] - 1)) continue;
+                    const int m = (int)place < field.count[o] - 2 ? (int)place : field.count[o] - 2;
+                    const int i = f == 0 ? line : m, j = f == 0 ? m : line;
+                    const REAL rises = field.rises(i, j, f), rise = rises / field.cell[o];
+                    const REAL slope = (along[2] - aside * rise) / across;
+                    const REAL up = on::inverse_root(1 + rise * rise + slope * slope);
+                    const REAL nf = -slope * up, no = -rise * up, x = f == 0 ? nf : no, y = f == 0 ? no : nf;
+                    const REAL depth = (field.height(i, j) + (place - m) * rises - at[2] - t * along[2]) * up;
+                    const bool carries = one[0] * x + one[1] * y + one[2] * up <= BESIDE
+                        && other[0] * x + other[1] * y + other[2] * up <= BESIDE;
+                    if (!carries || on::absolute(rise) > 1 || up < DOWN
+                        || depth > half - on::absolute(t) + slack) continue;
+                    REAL* row = best.take(depth, seat[u] + t * local[u], seat[v] + t * local[v]);
+                    if (!row) continue;
+                    row[0] = f == 0 ? LINE_Y : LINE_X, row[1] = i, row[2] = j;
+                    for (int x = 0; x < 3; ++x) row[3 + x] = local[x], row[6 + x] = seat[x];
+                }
+            }
+        }
+    };
+
     static CUDA_CALLABLE inline void box(const REAL* table, const REAL* asked, REAL* out)
     {
-        Field field(table, asked);
-        Best best(out);
-        const REAL *c = field.centre, *A = field.axes, *half = field.sizes;
-        const REAL slack = SLACK * least(least(half[0], half[1]), half[2]);
-        int lowest = 0;
-        for (int k = 1; k < 3; ++k)
-            if (on::absolute(A[3 * k + 2]) > on::absolute(A[3 * lowest + 2])) lowest = k;
-        const int u = (lowest + 1) % 3, v = (lowest + 2) % 3;
-        for (int f = 0; f < 2; ++f) {
-            REAL reach = 0;
-            for (int k = 0; k < 3; ++k) reach += on::absolute(A[3 * k + f]) * half[k];
-            field.between(c[f] - reach, c[f] + reach, f, false, field.low[f], field.high[f]);
-        }
+        Polyhedron shape(table, asked, out);
+        const Field& field = shape.field;
+        const REAL *A = field.axes, *half = field.sizes;
         LOOP
         for (int i = field.low[0]; i <= field.high[0]; ++i) {
             LOOP
             for (int j = field.low[1]; j <= field.high[1]; ++j) {
-                const REAL x = i * field.cell[0] - c[0], y = j * field.cell[1] - c[1], z = field.height(i, j) - c[2];
-                REAL q[3], inside[3], depth = FAR, side = 0;
-                for (int k = 0; k < 3; ++k) {
-                    q[k] = field.along(k, x, y, z);
-                    inside[k] = half[k] - on::absolute(q[k]);
-                }
+                REAL q[3], depth = FAR, side = FAR, normal[3] = {0, 0, 0}, offset = 0;
+                shape.from_middle(i, j, q);
                 int face = -1;
                 for (int k = 0; k < 3; ++k) {
-                    const REAL beside = least(inside[(k + 1) % 3], inside[(k + 2) % 3]);
-                    const REAL this_depth = half[k] + (A[3 * k + 2] > 0 ? q[k] : -q[k]);
-                    if (on::absolute(A[3 * k + 2]) >= DOWN && beside >= 0 && this_depth < depth)
-                        face = k, depth = this_depth, side = beside;
+                    const REAL inside = half[k] + (A[3 * k + 2] > 0 ? q[k] : -q[k]);
+                    if (on::absolute(A[3 * k + 2]) >= DOWN && inside < depth) face = k, depth = inside;
                 }
-                if (face < 0 || depth > side + slack) continue;
-                const REAL along_u = u == 0 ? q[0] : u == 1 ? q[1] : q[2];
-                const REAL along_v = v == 0 ? q[0] : v == 1 ? q[1] : q[2];
-                REAL* row = best.take(depth, along_u, along_v);
-                if (!row) continue;
-                row[0] = POINT, row[1] = i, row[2] = j;
+                if (face < 0) continue;
                 for (int k = 0; k < 3; ++k) {
-                    row[3 + k] = k == face ? (A[3 * k + 2] > 0 ? -1 : 1) : 0;
-                    row[6 + k] = row[3 + k] * half[k];
+                    const REAL upper = half[k] - (A[3 * k + 2] > 0 ? q[k] : -q[k]);
+                    const bool looks = on::absolute(A[3 * k + 2]) >= DOWN;
+                    normal[k] = k != face ? 0 : A[3 * k + 2] > 0 ? -1 : 1;
+                    offset += k == face ? half[k] : 0;
+                    if (k != face) side = least(side, looks ? upper : half[k] - on::absolute(q[k]));
                 }
+                shape.take_point(i, j, q, depth, side, normal, offset);
             }
         }
         LOOP
         for (int edge = 0; edge < 12; ++edge) {
             const int k = edge / 4, first = (k + 1) % 3, second = (k + 2) % 3;
             const REAL a = edge & 1 ? 1 : -1, b = edge & 2 ? 1 : -1;
-            if (!(least(a * A[3 * first + 2], b * A[3 * second + 2]) <= -DOWN)) continue;
-            const REAL p = a * half[first], r = b * half[second];
-            REAL at[3];
-            for (int x = 0; x < 3; ++x) at[x] = c[x] + p * A[3 * first + x] + r * A[3 * second + x];
-            LOOP
-            for (int f = 0; f < 2; ++f) {
-                const int o = 1 - f;
-                const REAL across = A[3 * k + f], aside = A[3 * k + o];
-                if (!(on::absolute(across) >= ACROSS)) continue;
-                const REAL wide = on::absolute(across) * half[k];
-                int line, last;
-                field.between(at[f] - wide, at[f] + wide, f, false, line, last);
-                LOOP
-                for (; line <= last; ++line) {
-                    const REAL t = (line * field.cell[f] - at[f]) / across;
-                    const REAL place = (at[o] + t * aside) / field.cell[o];
-                    if (on::absolute(t) > half[k] || !(place >= 0 && place <= field.count[o] - 1)) continue;
-                    const int m = (int)place < field.count[o] - 2 ? (int)place : field.count[o] - 2;
-                    const int i = f == 0 ? line : m, j = f == 0 ? m : line;
-                    const REAL rises = field.rises(i, j, f), rise = rises / field.cell[o];
-                    const REAL slope = (A[3 * k + 2] - aside * rise) / across;
-                    const REAL up = on::inverse_root(1 + rise * rise + slope * slope);
-                    const REAL nf = -slope * up, no = -rise * up, x = f == 0 ? nf : no, y = f == 0 ? no : nf;
-                    const REAL depth = (field.height(i, j) + (place - m) * rises - at[2] - t * A[3 * k + 2]) * up;
-                    const bool carries = a * field.along(first, x, y, up) <= BESIDE
-                        && b * field.along(second, x, y, up) <= BESIDE;
-                    if (!carries || on::absolute(rise) > 1 || up < DOWN
-                        || depth > half[k] - on::absolute(t) + slack) continue;
-                    REAL* row = best.take(depth, u == k ? t : u == first ? p : r, v == k ? t : v == first ? p : r);
-                    if (!row) continue;
-                    row[0] = f == 0 ? LINE_Y : LINE_X, row[1] = i, row[2] = j;
-                    for (int x = 0; x < 3; ++x) {
-                        row[3 + x] = x == k;
-                        row[6 + x] = x == first ? p : x == second ? r : 0;
-                    }
-                }
+            REAL seat[3], local[3], one[3], other[3];
+            for (int x = 0; x < 3; ++x) {
+                one[x] = x == first ? a : 0, other[x] = x == second ? b : 0, local[x] = x == k;
+                seat[x] = half[x] * (one[x] + other[x]);
             }
+            shape.cross(seat, local, half[k], one, other);
+        }
+    }
+
+    // Of a hull the numbers of faces and edges, and then of each face four and of each edge thirteen, follow in ``of``.
+    static CUDA_CALLABLE inline void hull(const REAL* table, const REAL* asked, const REAL* of, int edges, REAL* out)
+    {
+        Polyhedron shape(table, asked, out);
+        const Field& field = shape.field;
+        const REAL* A = field.axes;
+        const int faces = (int)of[0];
+        LOOP
+        for (int i = field.low[0]; i <= field.high[0]; ++i) {
+            LOOP
+            for (int j = field.low[1]; j <= field.high[1]; ++j) {
+                REAL q[3], depth = FAR, side = FAR;
+                shape.from_middle(i, j, q);
+                int face = -1;
+                LOOP
+                for (int n = 0; n < faces; ++n) {
+                    const REAL* each = of + 1 + 4 * n;
+                    if (!(each[0] * A[2] + each[1] * A[5] + each[2] * A[8] <= -DOWN)) continue;
+                    const REAL inside = each[3] - each[0] * q[0] - each[1] * q[1] - each[2] * q[2];
+                    if (inside < depth) face = n, depth = inside;
+                }
+                if (face < 0) continue;
+                const REAL* out = of + 1 + 4 * face;
+                LOOP
+                for (int n = 0; n < faces; ++n) {
+                    const REAL* each = of + 1 + 4 * n;
+                    const bool looks = each[0] * A[2] + each[1] * A[5] + each[2] * A[8] <= -DOWN;
+                    const bool against = each[0] * out[0] + each[1] * out[1] + each[2] * out[2] <= -DOWN;
+                    const REAL inside = each[3] - each[0] * q[0] - each[1] * q[1] - each[2] * q[2];
+                    if (!looks && !against) side = least(side, inside);
+                }
+                shape.take_point(i, j, q, depth, side, out, out[3]);
+            }
+        }
+        LOOP
+        for (int edge = 0; edge < edges; ++edge) {
+            const REAL* each = of + 1 + 4 * faces + 13 * edge;
+            shape.cross(each, each + 3, each[6], each + 7, each + 10);
         }
     }
 

@@ -1,7 +1,7 @@
 """The specification of where shapes touch the grid of a height field: its points, and its lines between them.
 
-A box touches grid points under its faces that look down, along the face's normal, and grid lines where they cross its
-edges, along the normal of both. A capsule touches a point or a line where that is nearest to its axis. Each candidate
+A box or a hull touches grid points under its faces that look down, along the face's normal, and grid lines where they
+cross its edges, along the normal of both. A capsule touches a point or a line where that is nearest to its axis. Each candidate
 has a depth, negative outside. The deepest of each quadrant of the shape are rows of their own: of two the first found
 counts, unless the other is deeper by more than TIE, where being farther out counts as deeper by OUTWARD of that.
 
@@ -22,16 +22,18 @@ PARALLEL = 1e-6  # square of the sine below which an axis and a grid line are pa
 
 
 def find(shape, heights, numbers):
-    """Return the rows [QUADRANTS, ROW] of a shape: "box" or "capsule".
+    """Return the rows [QUADRANTS, ROW] of a shape: "box", "capsule" or "hull".
 
     Args:
         heights: of all fields, row after row. numbers: of the first height of the field; the shape's middle from there
-            (3) [m]; its axes, one a row (9); its sizes (3) [m]; the cell along x and y [m]; points along x and y.
+            (3) [m]; its axes, one a row (9); its sizes (3) [m]; the cell along x and y [m]; points along x and y; of
+            a hull the number of faces, their normals and distances from the middle, and the edges, see _polyhedron.
     """
-    first, centre, axes, sizes, cell, counts = np.split(np.asarray(numbers, dtype=np.float64), [1, 4, 13, 16, 18])
+    numbers = np.asarray(numbers, dtype=np.float64)
+    first, centre, axes, sizes, cell, counts, table = np.split(numbers, [1, 4, 13, 16, 18, 20])
     counts = counts.astype(int)
     field = heights[int(first[0]) :][: counts[0] * counts[1]].reshape(counts)
-    return SHAPES[shape](field, cell, centre, axes.reshape(3, 3), sizes)
+    return SHAPES[shape](field, cell, centre, axes.reshape(3, 3), sizes, table)
 
 
 def _choose(candidates):
@@ -52,51 +54,66 @@ def _between(low, high, cell, count):
     return int(np.ceil(low)), int(np.floor(high)), int(np.floor(low)), int(np.ceil(high))
 
 
-def _box(field, cell, centre, axes, half):
-    reach = np.abs(axes.T) @ half
+def _box(field, cell, centre, axes, half, table):
+    faces = [(sign * unit, size) for unit, size in zip(np.eye(3), half, strict=True) for sign in (-1.0, 1.0)]
+    edges = []
+    for k in range(3):
+        first, second = np.eye(3)[(k + 1) % 3], np.eye(3)[(k + 2) % 3]
+        for b, a in ((b, a) for b in (-1.0, 1.0) for a in (-1.0, 1.0)):
+            seat = half * (a * first + b * second)
+            edges.append((seat, np.eye(3)[k], half[k], a * first, b * second))
+    return _choose(_polyhedron(field, cell, centre, axes, np.abs(axes.T) @ half, SLACK * half.min(), faces, edges))
+
+
+def _hull(field, cell, centre, axes, half, table):
+    count, rest = int(table[0]), table[1:]
+    faces = [(row[:3], row[3]) for row in rest[: 4 * count].reshape(-1, 4)]
+    edges = [(row[:3], row[3:6], row[6], row[7:10], row[10:13]) for row in rest[4 * count :].reshape(-1, 13)]
+    return _choose(_polyhedron(field, cell, centre, axes, np.abs(axes.T) @ half, SLACK * half.min(), faces, edges))
+
+
+def _polyhedron(field, cell, centre, axes, reach, slack, faces, edges):
+    """Return the candidates of a convex polyhedron.
+
+    Args:
+        reach: half its extent along x and y. faces: outward normal and distance from the middle. edges: middle,
+            direction, half the length, and the normals of both faces. All in the axes of the shape.
+    """
     ranges = [_between(centre[f] - reach[f], centre[f] + reach[f], cell[f], field.shape[f]) for f in (0, 1)]
-    down = np.where(axes[:, 2] > 0.0, -1.0, 1.0)  # the side of each axis that looks down
-    looks = np.abs(axes[:, 2]) >= DOWN
-    lowest = int(np.abs(axes[:, 2]).argmax())
-    u, v = (lowest + 1) % 3, (lowest + 2) % 3
-    slack = SLACK * half.min()
-    found = []
+    u, v = ((int(np.abs(axes[:, 2]).argmax()) + more) % 3 for more in (1, 2))
+    found, looks = [], [normal @ axes[:, 2] <= -DOWN for normal, _ in faces]
     for i in range(ranges[0][0], ranges[0][1] + 1):
         for j in range(ranges[1][0], ranges[1][1] + 1):
             q = axes @ (np.array([i * cell[0], j * cell[1], field[i, j]]) - centre)
-            inside = half - np.abs(q)
-            face, depth = -1, np.inf
-            for k in range(3):
-                if looks[k] and min(inside[(k + 1) % 3], inside[(k + 2) % 3]) >= 0.0:
-                    this = half[k] - down[k] * q[k]
-                    face, depth = (k, this) if this < depth else (face, depth)
-            if face >= 0 and depth <= min(inside[(face + 1) % 3], inside[(face + 2) % 3]) + slack:
-                out = down[face] * np.eye(3)[face]
-                found.append((depth, q[u], q[v], [POINT, i, j, *out, *(half * out)]))
-    for k in range(3):
-        first, second = (k + 1) % 3, (k + 2) % 3
-        for b, a in ((b, a) for b in (-1.0, 1.0) for a in (-1.0, 1.0)):
-            if not min(a * axes[first, 2], b * axes[second, 2]) <= -DOWN:
-                continue
-            seat = a * half[first] * np.eye(3)[first] + b * half[second] * np.eye(3)[second]
-            at, along = centre + axes.T @ seat, axes[k]
+            inside = [offset - normal @ q for normal, offset in faces]
+            down = [depth if look else np.inf for depth, look in zip(inside, looks, strict=True)]
+            best = int(np.argmin(down))
+            out, depth = faces[best][0], down[best]
+            side = min(
+                (x for x, look, (n, _) in zip(inside, looks, faces, strict=True) if not look and n @ out > -DOWN),
+                default=np.inf,
+            )
+            if np.isfinite(depth) and side >= 0.0 and depth <= side + slack:
+                found.append((depth, q[u], q[v], [POINT, i, j, *out, *(faces[best][1] * out)]))
+    for seat, along, half, *both in edges:
+        if min(normal @ axes[:, 2] for normal in both) <= -DOWN:
             for f in (0, 1):
-                found += _crossings(field, cell, at, along, f, half, k, (first, a, second, b), axes, seat, slack, u, v)
-    return _choose(found)
+                found += _crossings(field, cell, centre, axes, seat, along, half, both, f, slack, u, v)
+    return found
 
 
-def _crossings(field, cell, at, along, f, half, k, faces, axes, seat, slack, u, v):
+def _crossings(field, cell, centre, axes, seat, local, half, both, f, slack, u, v):
     """Return the candidates where lines at constant x (``f`` 0) or y cross an edge."""
+    at, along = centre + axes.T @ seat, axes.T @ local
     o, across, found = 1 - f, along[f], []
     if not abs(across) >= ACROSS:
         return found
-    first, a, second, b = faces
-    wide = abs(across) * half[k]
+    wide = abs(across) * half
     begin, end, *_ = _between(at[f] - wide, at[f] + wide, cell[f], field.shape[f])
     for line in range(begin, end + 1):
         t = (line * cell[f] - at[f]) / across
         place = (at[o] + t * along[o]) / cell[o]
-        if abs(t) > half[k] or not 0.0 <= place <= field.shape[o] - 1.0:
+        if abs(t) > half or not 0.0 <= place <= field.shape[o] - 1.0:
             continue
         m = min(int(place), field.shape[o] - 2)
         i, j = (line, m) if f == 0 else (m, line)
@@ -107,14 +124,14 @@ def _crossings(field, cell, at, along, f, half, k, faces, axes, seat, slack, u, 
         n = np.array([0.0, 0.0, up])
         n[f], n[o] = -slope * up, -rise * up
         depth = (field[i, j] + (place - m) * rises - at[2] - t * along[2]) * up
-        carries = a * (axes[first] @ n) <= BESIDE and b * (axes[second] @ n) <= BESIDE
-        if abs(rise) <= 1.0 and up >= DOWN and carries and depth <= half[k] - abs(t) + slack:
-            q = seat + t * np.eye(3)[k]
-            found.append((depth, q[u], q[v], [LINE_Y if f == 0 else LINE_X, i, j, *np.eye(3)[k], *seat]))
+        carries = all(normal @ (axes @ n) <= BESIDE for normal in both)
+        if abs(rise) <= 1.0 and up >= DOWN and carries and depth <= half - abs(t) + slack:
+            q = seat + t * local
+            found.append((depth, q[u], q[v], [LINE_Y if f == 0 else LINE_X, i, j, *local, *seat]))
     return found
 
 
-def _capsule(field, cell, centre, axes, sizes):
+def _capsule(field, cell, centre, axes, sizes, table):
     radius, _, half = sizes
     axis, found = axes[2], []
     reach = np.abs(axis[:2]) * half + radius
@@ -158,7 +175,7 @@ def _height(field, cell, at):
     return np.array([1.0 - s, s]) @ field[i : i + 2, j : j + 2] @ np.array([1.0 - t, t])
 
 
-SHAPES = {"box": _box, "capsule": _capsule}
+SHAPES = {"box": _box, "capsule": _capsule, "hull": _hull}
 
 
 def touched(shape, field, cell, centre, axes, sizes, radius, row):
