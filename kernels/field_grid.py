@@ -5,6 +5,7 @@ so that their code is short however many points of the grid lie under a shape.
 """
 
 import functools
+import math
 
 import warp as wp
 
@@ -13,9 +14,9 @@ from .elementary import C_TYPE
 NAME = "grid_search"
 RULES = {
     "OUTWARD": 1e-3, "TIE": 1e-6, "DOWN": 0.5, "ACROSS": 0.17, "BESIDE": 0.35, "SLACK": 0.5, "PARALLEL": 1e-6,
-    "FAR": 1e30,
+    "FAR": 1e30, "STANDS": 0.7, "PI": math.pi,
 }  # fmt: skip
-KINDS = {"QUADRANTS": 4, "POINT": 1, "LINE_Y": 2, "LINE_X": 3, "ROW": 9}
+KINDS = {"QUADRANTS": 4, "SIDE": 3, "RIM": 32, "POINT": 1, "LINE_Y": 2, "LINE_X": 3, "ROW": 9}
 
 
 def definitions(code: str, T: type) -> list[str]:
@@ -119,7 +120,8 @@ struct grid_search
         REAL slack;
         int u, v;
 
-        CUDA_CALLABLE inline Polyhedron(const REAL* table, const REAL* asked, REAL* out) : field(table, asked), best(out)
+        CUDA_CALLABLE inline Polyhedron(const REAL* table, const REAL* asked, REAL* out)
+            : field(table, asked), best(out)
         {
             const REAL *c = field.centre, *A = field.axes, *half = field.sizes;
             slack = SLACK * least(least(half[0], half[1]), half[2]);
@@ -239,13 +241,13 @@ struct grid_search
         }
     }
 
-    // Of a hull the numbers of faces and edges, and then of each face four and of each edge thirteen, follow in ``of``.
-    static CUDA_CALLABLE inline void hull(const REAL* table, const REAL* asked, const REAL* of, int edges, REAL* out)
+    // The hull's own ``count`` numbers: how many faces it has, four numbers of each, and thirteen of each edge.
+    static CUDA_CALLABLE inline void hull(const REAL* table, const REAL* asked, const REAL* of, int count, REAL* out)
     {
         Polyhedron shape(table, asked, out);
         const Field& field = shape.field;
         const REAL* A = field.axes;
-        const int faces = (int)of[0];
+        const int faces = (int)of[0], edges = (count - 1 - 4 * faces) / 13;
         LOOP
         for (int i = field.low[0]; i <= field.high[0]; ++i) {
             LOOP
@@ -261,16 +263,16 @@ struct grid_search
                     if (inside < depth) face = n, depth = inside;
                 }
                 if (face < 0) continue;
-                const REAL* out = of + 1 + 4 * face;
+                const REAL* normal = of + 1 + 4 * face;
                 LOOP
                 for (int n = 0; n < faces; ++n) {
                     const REAL* each = of + 1 + 4 * n;
                     const bool looks = each[0] * A[2] + each[1] * A[5] + each[2] * A[8] <= -DOWN;
-                    const bool against = each[0] * out[0] + each[1] * out[1] + each[2] * out[2] <= -DOWN;
+                    const bool against = each[0] * normal[0] + each[1] * normal[1] + each[2] * normal[2] <= -DOWN;
                     const REAL inside = each[3] - each[0] * q[0] - each[1] * q[1] - each[2] * q[2];
                     if (!looks && !against) side = least(side, inside);
                 }
-                shape.take_point(i, j, q, depth, side, out, out[3]);
+                shape.take_point(i, j, q, depth, side, normal, normal[3]);
             }
         }
         LOOP
@@ -280,7 +282,44 @@ struct grid_search
         }
     }
 
+    static CUDA_CALLABLE inline void cylinder(const REAL* table, const REAL* asked, REAL* out)
+    {
+        const REAL radius = asked[13], half = asked[15], lean = asked[12];
+        if (on::absolute(lean) < STANDS) {
+            beside_axis(table, asked, SLACK * least(radius, half), SIDE, out);
+            return;
+        }
+        Polyhedron shape(table, asked, out);
+        const Field& field = shape.field;
+        const REAL down[3] = {0, 0, (REAL)(lean > 0 ? -1 : 1)};
+        LOOP
+        for (int i = field.low[0]; i <= field.high[0]; ++i) {
+            LOOP
+            for (int j = field.low[1]; j <= field.high[1]; ++j) {
+                REAL q[3];
+                shape.from_middle(i, j, q);
+                const REAL side = radius - on::sqrt(q[0] * q[0] + q[1] * q[1]);
+                shape.take_point(i, j, q, half - down[2] * q[2], side, down, half);
+            }
+        }
+        REAL turn[2], share[2];
+        on::sincos(PI / RIM, share[1], share[0]);
+        LOOP
+        for (int edge = 0; edge < RIM; ++edge) {
+            on::sincos(2 * PI / RIM * edge, turn[1], turn[0]);
+            const REAL out[3] = {turn[0], turn[1], 0}, local[3] = {-turn[1], turn[0], 0};
+            const REAL far = radius * share[0], seat[3] = {far * out[0], far * out[1], half * down[2]};
+            shape.cross(seat, local, radius * share[1], out, down);
+        }
+    }
+
     static CUDA_CALLABLE inline void capsule(const REAL* table, const REAL* asked, REAL* out)
+    {
+        beside_axis(table, asked, 0, 0, out);
+    }
+
+    // ``kind`` is SIDE for a cylinder, which has faces at the ends of its axis, else 0.
+    static CUDA_CALLABLE inline void beside_axis(const REAL* table, const REAL* asked, REAL slack, int kind, REAL* out)
     {
         Field field(table, asked);
         Best best(out);
@@ -321,10 +360,14 @@ struct grid_search
                     }
                     const REAL z = c[2] + t * axis[2];
                     const bool outside = surface(field, c[0] + t * axis[0], c[1] + t * axis[1]) <= z;
-                    if (outside && !(away[2] > 0)) continue;
-                    REAL* row = best.take(-on::sqrt(squares), t, 0);
+                    const REAL distance = on::sqrt(squares);
+                    const bool side = away[2] >= DOWN * distance
+                        && radius - distance <= half - on::absolute(t) + slack;
+                    if (outside && !(kind ? side : away[2] > 0)) continue;
+                    REAL* row = best.take(-distance, t, 0);
                     if (!row) continue;
-                    row[0] = f < 0 ? POINT : f == 0 ? LINE_Y : LINE_X, row[1] = i, row[2] = j;
+                    row[0] = kind; // of the side, or none
+                    row[0] += f < 0 ? POINT : f == 0 ? LINE_Y : LINE_X, row[1] = i, row[2] = j;
                     row[3] = outside ? 1 : -1;
                 }
             }

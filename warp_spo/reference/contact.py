@@ -404,6 +404,7 @@ class ContactStep:
         axes, shape = np.array(support.axes) @ pose[:3, :3].T, support.kind.partition(" ")[0]
         heights = ground.heights.reshape(-1, *ground.heights.shape[-2:])
         numbers = [which * heights[0].size, *(middle - start), *axes.ravel(), *support.sizes, *cell, *heights[0].shape]
+        numbers += support.table
         row = find(shape, heights.ravel(), numbers)[support.number]
         found = touched(shape, heights[which], cell, middle - start, axes, support.sizes, point.radius, row)
         if found is None:

@@ -1,8 +1,9 @@
 """The specification of where shapes touch the grid of a height field: its points, and its lines between them.
 
 A box or a hull touches grid points under its faces that look down, along the face's normal, and grid lines where they
-cross its edges, along the normal of both. A capsule touches a point or a line where that is nearest to its axis. Each candidate
-has a depth, negative outside. The deepest of each quadrant of the shape are rows of their own: of two the first found
+cross its edges, along the normal of both. A capsule touches a point or a line where that is nearest to its axis. A
+cylinder that stands is a disc, with RIM edges, and one that lies is a capsule without its ends. Each candidate has a
+depth, negative outside. The deepest of each quadrant of the shape are rows of their own: of two the first found
 counts, unless the other is deeper by more than TIE, where being farther out counts as deeper by OUTWARD of that.
 
 What is found is discrete: which point or line, and which face or edge. Where it lies follows from the pose and heights.
@@ -12,7 +13,9 @@ import numpy as np
 
 ROW = 9  # numbers of a row: its kind, i, j of a grid point, a direction and a place on the shape, in its axes
 NONE, POINT, LINE_Y, LINE_X = 0.0, 1.0, 2.0, 3.0  # kinds: a grid point; from there a line along y, or along x
-QUADRANTS = 4
+SIDE = 3.0  # added to the kinds of what the side of a cylinder touches
+QUADRANTS, RIM = 4, 32
+STANDS = 0.7  # cosine of the lean up to which a cylinder stands
 OUTWARD, TIE = 1e-3, 1e-6  # share of the distance from the middle that counts as depth; what is as deep [m]
 DOWN = 0.5  # by how much a face or an edge looks down at least: the cosine of 60 degrees
 ACROSS = 0.17  # sine of the angle between an edge and a grid line, seen from above, at least
@@ -22,7 +25,7 @@ PARALLEL = 1e-6  # square of the sine below which an axis and a grid line are pa
 
 
 def find(shape, heights, numbers):
-    """Return the rows [QUADRANTS, ROW] of a shape: "box", "capsule" or "hull".
+    """Return the rows [QUADRANTS, ROW] of a shape: "box", "capsule", "hull" or "cylinder".
 
     Args:
         heights: of all fields, row after row. numbers: of the first height of the field; the shape's middle from there
@@ -72,12 +75,13 @@ def _hull(field, cell, centre, axes, half, table):
     return _choose(_polyhedron(field, cell, centre, axes, np.abs(axes.T) @ half, SLACK * half.min(), faces, edges))
 
 
-def _polyhedron(field, cell, centre, axes, reach, slack, faces, edges):
+def _polyhedron(field, cell, centre, axes, reach, slack, faces, edges, round_by=np.inf):
     """Return the candidates of a convex polyhedron.
 
     Args:
         reach: half its extent along x and y. faces: outward normal and distance from the middle. edges: middle,
-            direction, half the length, and the normals of both faces. All in the axes of the shape.
+            direction, half the length, and the normals of both faces. All in the axes of the shape. round_by: how far
+            from its third axis it reaches, where that bounds its faces.
     """
     ranges = [_between(centre[f] - reach[f], centre[f] + reach[f], cell[f], field.shape[f]) for f in (0, 1)]
     u, v = ((int(np.abs(axes[:, 2]).argmax()) + more) % 3 for more in (1, 2))
@@ -93,6 +97,7 @@ def _polyhedron(field, cell, centre, axes, reach, slack, faces, edges):
                 (x for x, look, (n, _) in zip(inside, looks, faces, strict=True) if not look and n @ out > -DOWN),
                 default=np.inf,
             )
+            side = min(side, round_by - np.sqrt(q[0] * q[0] + q[1] * q[1]))
             if np.isfinite(depth) and side >= 0.0 and depth <= side + slack:
                 found.append((depth, q[u], q[v], [POINT, i, j, *out, *(faces[best][1] * out)]))
     for seat, along, half, *both in edges:
@@ -131,9 +136,30 @@ def _crossings(field, cell, centre, axes, seat, local, half, both, f, slack, u, 
     return found
 
 
+def _cylinder(field, cell, centre, axes, sizes, table):
+    radius, _, half = sizes
+    slack = SLACK * sizes.min()
+    if abs(axes[2, 2]) < STANDS:
+        return _choose(_beside_axis(field, cell, centre, axes[2], radius, half, slack))
+    down, share = np.array([0.0, 0.0, -1.0 if axes[2, 2] > 0.0 else 1.0]), np.pi / RIM
+    edges = []
+    for n in range(RIM):
+        cos, sin = np.cos(2.0 * share * n), np.sin(2.0 * share * n)
+        out = np.array([cos, sin, 0.0])
+        seat = radius * np.cos(share) * out + half * down
+        edges.append((seat, np.array([-sin, cos, 0.0]), radius * np.sin(share), out, down))
+    found = _polyhedron(field, cell, centre, axes, np.abs(axes.T) @ sizes, slack, [(down, half)], edges, radius)
+    return _choose(found)
+
+
 def _capsule(field, cell, centre, axes, sizes, table):
     radius, _, half = sizes
-    axis, found = axes[2], []
+    return _choose(_beside_axis(field, cell, centre, axes[2], radius, half))
+
+
+def _beside_axis(field, cell, centre, axis, radius, half, slack=None):
+    """Return the candidates beside an axis; ``slack``: of a cylinder, which has faces at the ends of its axis."""
+    found = []
     reach = np.abs(axis[:2]) * half + radius
     ranges = [_between(centre[f] - reach[f], centre[f] + reach[f], cell[f], field.shape[f]) for f in (0, 1)]
     for i in range(ranges[0][2], ranges[0][3] + 1):
@@ -162,9 +188,12 @@ def _capsule(field, cell, centre, axes, sizes, table):
         distance = np.sqrt(away @ away)
         if abs(t) < half:
             outside = _height(field, cell, centre + t * axis) <= (centre + t * axis)[2]
-            if not outside or away[2] > 0.0:
+            if slack is not None:
+                side = away[2] >= DOWN * distance and radius - distance <= half - abs(t) + slack
+                kind += SIDE
+            if not outside or (away[2] > 0.0 if slack is None else side):
                 rows.append((-distance, t, 0.0, [kind, i, j, 1.0 if outside else -1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    return _choose(rows)
+    return rows
 
 
 def _height(field, cell, at):
@@ -175,7 +204,7 @@ def _height(field, cell, at):
     return np.array([1.0 - s, s]) @ field[i : i + 2, j : j + 2] @ np.array([1.0 - t, t])
 
 
-SHAPES = {"box": _box, "capsule": _capsule, "hull": _hull}
+SHAPES = {"box": _box, "capsule": _capsule, "hull": _hull, "cylinder": _cylinder}
 
 
 def touched(shape, field, cell, centre, axes, sizes, radius, row):
@@ -190,10 +219,13 @@ def touched(shape, field, cell, centre, axes, sizes, radius, row):
         return None
     corner = np.array([i * cell[0], j * cell[1], field[i, j]])
     g = np.array([0.0, 0.0, 0.0])
+    beside = shape == "capsule" or kind > SIDE
+    size = sizes[0] if shape == "capsule" else sizes[0] + radius
+    kind -= SIDE * (kind > SIDE)
     if kind != POINT:
         f = 0 if kind == LINE_Y else 1
         g[1 - f], g[2] = cell[1 - f], (field[i, j + 1] if f == 0 else field[i + 1, j]) - field[i, j]
-    if shape == "capsule":
+    if beside:
         w, axis = centre - corner, axes[2]
         t, s = -(axis @ w), 0.0
         if kind != POINT:
@@ -203,7 +235,7 @@ def touched(shape, field, cell, centre, axes, sizes, radius, row):
         away = w + t * axis - s * g
         distance = row[3] * np.linalg.norm(away)
         n = away / distance
-        return n, sizes[0] - distance, centre + t * axis - sizes[0] * n
+        return n, size - distance, centre + t * axis - size * n
     out, at = axes.T @ row[3:6], centre + axes.T @ row[6:9]
     if kind == POINT:
         depth = out @ (at - corner)

@@ -20,7 +20,7 @@ from .frames import pose_matrix
 from .hulls import Hull, convex_hull, grown, is_convex, with_corners
 from .parts import IDENTITY_POSE, checked_pose
 from .pickling import StoredPart
-from .supports import BOX_GRID, CAPSULE_GRID, CORNER, RIM, SURFACE, Support
+from .supports import BOX_GRID, CAPSULE_GRID, CORNER, CYLINDER_GRID, HULL_GRID, RIM, SURFACE, Support
 
 SWEPT_SEGMENT, BOX, HULL = 0, 1, 2
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])  # of a cube
@@ -442,6 +442,12 @@ class CylinderShape(ContactShape):
         found = [Support(RIM, rows, (top, bottom, half), number) for number in range(max(2, min(4, self.most)))]
         return self.ends.mean(axis=0), self.margin, found
 
+    def grid_supports(self) -> tuple[np.ndarray, list[Support]]:
+        (axes, half), (radius, other) = self._frame(), self.radii
+        rows = tuple(map(tuple, axes.tolist()))
+        found = [Support(CYLINDER_GRID, rows, (radius, radius, half), number) for number in range(4)]
+        return self.ends.mean(axis=0), found if radius == other else []
+
     def ground_points(self) -> tuple[np.ndarray, float]:
         axes, _ = self._frame()
         rims = [end + _ring(RING, radius) @ axes for end, radius in zip(self.ends, self.radii, strict=True)]
@@ -497,6 +503,19 @@ class HullShape(ContactShape):
 
     def ground_points(self) -> tuple[np.ndarray, float]:
         return self._corners, 0.0
+
+    @functools.cached_property
+    def _grid_supports(self) -> tuple[np.ndarray, list[Support]]:
+        try:
+            hull, middle = convex_hull("", self.points, self._corners)
+        except (ValueError, UnsupportedError):  # flat, or of more faces than all searches take
+            return np.zeros(3), []
+        axes, half = tuple(map(tuple, np.eye(3).tolist())), np.ptp(hull.corners, axis=0) / 2.0
+        sizes = float(half[0]), float(half[1]), float(half[2])
+        return middle, [Support(HULL_GRID, axes, sizes, number, hull.grid_table) for number in range(4)]
+
+    def grid_supports(self) -> tuple[np.ndarray, list[Support]]:
+        return self._grid_supports
 
     def surface_points(self, most: int) -> np.ndarray:
         points = self.points[farthest_points(self.points, most)] if len(self.points) else np.zeros((0, 3))

@@ -13,9 +13,9 @@ import numpy as np
 CORNER, RIM, SURFACE = "corner", "rim", "surface"
 """Corners of the face of a box that looks down; points on the rims of a cylinder or a cone; the lowest of an
 ellipsoid."""
-BOX_GRID, CAPSULE_GRID = "box grid", "capsule grid"
+BOX_GRID, CAPSULE_GRID, HULL_GRID, CYLINDER_GRID = "box grid", "capsule grid", "hull grid", "cylinder grid"
 """Where a shape touches points and lines of a height field's grid, see :mod:`warp_spo.reference.field_grid`."""
-GRIDS = {BOX_GRID: ("box", 4), CAPSULE_GRID: ("capsule", 2)}
+GRIDS = {BOX_GRID: ("box", 4), CAPSULE_GRID: ("capsule", 2), HULL_GRID: ("hull", 4), CYLINDER_GRID: ("cylinder", 4)}
 """The shape in the search for such places, and how many of them it has."""
 UPRIGHT = 1e-8  # square of the sine below which an axis is along the normal, and points on a rim keep their places
 SIDES = (-0.5, np.sqrt(0.75))  # cosine and sine of 120 degrees, from the lowest point of a rim to those beside it
@@ -37,6 +37,7 @@ class Support(NamedTuple):
     axes: tuple[tuple[float, float, float], ...]
     sizes: tuple[float, float, float]
     number: int
+    table: tuple[float, ...] = ()
 
     @property
     def signs(self) -> tuple[float, float]:
@@ -96,4 +97,12 @@ def _lowest(n: np.ndarray, half: np.ndarray, number: int) -> np.ndarray:
     return -(half**2) * n / np.linalg.norm(half * n)
 
 
-OFFSETS = {CORNER: _corner, RIM: _rim, SURFACE: _lowest, BOX_GRID: _in_quadrant, CAPSULE_GRID: _on_axis}
+OFFSETS = {
+    CORNER: _corner,
+    RIM: _rim,
+    SURFACE: _lowest,
+    BOX_GRID: _in_quadrant,
+    HULL_GRID: _in_quadrant,
+    CYLINDER_GRID: _in_quadrant,
+    CAPSULE_GRID: _on_axis,
+}

@@ -33,6 +33,7 @@ COST = {  # floating-point operations of a statement
     "search": 1,
     "floor": 1,
 }
+SEARCHED = 20  # numbers of a search, before what a shape lists
 COST_ELSE = 8  # of the other statements: sines, roots and reciprocals take about as long as 8 additions
 
 
@@ -358,11 +359,15 @@ class Emitter:
     def _search_statements(self, scalar: Scalar, step: str) -> list[str]:
         """Return the statements of all numbers that a search finds."""
         (table, shape, count, _, *values), T = scalar.args, C_TYPE[self.dtype]
-        asked, found = ", ".join(map(self._text, values)), search(scalar.graph, table, shape, values, count)
+        found, own = search(scalar.graph, table, shape, values, count), values[SEARCHED:]  # a table of the shape's own
+        asked = ", ".join(map(self._text, values[:SEARCHED]))
         names = [self._name(each, step) for each in found]
-        row = f"{names[0]}_row"
-        call = f"grid_search::{shape}({table}.data, {names[0]}_asked, {row});"
-        lines = [f"const {T} {names[0]}_asked[{len(values)}] = {{{asked}}};", f"{T} {row}[{count}];", call]
+        row, more = f"{names[0]}_row", ""
+        lines = [f"const {T} {names[0]}_asked[{SEARCHED}] = {{{asked}}};", f"{T} {row}[{count}];"]
+        if own:
+            listed, more = ", ".join(literal(x, self.dtype) for x in own), f"{names[0]}_of, {len(own)}, "
+            lines.append(f"static const {T} {names[0]}_of[{len(own)}] = {{{listed}}};")
+        lines.append(f"grid_search::{shape}({table}.data, {names[0]}_asked, {more}{row});")
         return [*lines, *(f"const {T} {name} = {row}[{i}];" for i, name in enumerate(names))]
 
     def _fused_statement(self, scalar: Scalar, product: Scalar, step: str) -> list[str]:

@@ -11,13 +11,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from ...scene.ground import AWAY, HeightField
-from ...scene.supports import CAPSULE_GRID, GRIDS
-from ...trace.scalars import Graph, Scalar, Value, floor, inverse_root, less, reciprocal, search, select
+from ...scene.supports import CAPSULE_GRID, CYLINDER_GRID, GRIDS
+from ...trace.scalars import Graph, Scalar, Value, floor, inverse_root, is_constant, less, reciprocal, search, select
 from ...trace.spatial import Vector, dot, total
 from .ground import GROUND, Corners, GroundOffset, Surface, clamp, facing
 
 QUADRANTS, ROW = 4, 9  # rows of a search, and numbers of a row
-NONE, POINT, LINE_Y = 0.5, 1.5, 2.5  # numbers below which a row's kind is none, a point, a line along y
+NONE, POINT, LINE_Y, FACE = 0.5, 1.5, 2.5, 3.5  # below which a row's kind is none, a point, a line along y, a face's
+SIDE = 3.0  # added to the kinds of what the side of a cylinder touches
 
 
 class Shape(NamedTuple):
@@ -25,7 +26,7 @@ class Shape(NamedTuple):
 
     Attributes:
         kind: one of GRIDS. centre: its middle, from the field's first point. axes: one each, inertial axes.
-        sizes: those of its supports [m]. radius: by which it is larger [m].
+        sizes, table: those of its supports. radius: by which it is larger [m].
     """
 
     kind: str
@@ -33,6 +34,7 @@ class Shape(NamedTuple):
     axes: list[Vector]
     sizes: list[Value]
     radius: Value
+    table: tuple[float, ...] = ()
 
 
 class Touch(NamedTuple):
@@ -49,7 +51,7 @@ def find(graph: Graph, ground: HeightField, place: GroundOffset, shape: Shape) -
     if ground.count > 1:
         first = floor(clamp(place.field, ground.count - 1.0)) * float(rows * columns)
     asked = [first, *shape.centre, *(x for axis in shape.axes for x in axis), *shape.sizes]
-    asked += [*ground.cells, float(rows), float(columns)]
+    asked += [*ground.cells, float(rows), float(columns), *shape.table]
     return search(graph, GROUND, GRIDS[shape.kind][0], asked, QUADRANTS * ROW)
 
 
@@ -58,16 +60,27 @@ def touch(
 ) -> Touch:
     """Return where the shape touches what a row of :func:`find` names; ``near`` as of a surface that is always near."""
     kind, i, j, *found = row
-    (size_x, size_y), along_y = ground.cells, less(kind, LINE_Y)
+    there = less(NONE, kind)
+    beside: Value = float(shape.kind == CAPSULE_GRID)
+    if shape.kind == CYLINDER_GRID:
+        beside = less(FACE, kind)
+        kind = kind - SIDE * beside
+    (size_x, size_y), along_y, is_point = ground.cells, less(kind, LINE_Y), less(kind, POINT)
     cell = Corners.of(graph, ground, place, i, j)
     corner = Vector((i * size_x, j * size_y, cell.h00))
     size = size_y if size_x == size_y else select(along_y, size_y, size_x)
     rises = select(along_y, cell.h01, cell.h10) - cell.h00
-    is_point, there = less(kind, POINT), less(NONE, kind)
-    if shape.kind == CAPSULE_GRID:
-        normal, depth, seat = _beside_axis(shape, corner, size, rises, along_y, is_point, found[0])
-    else:
-        normal, depth, seat = _under_face(shape, corner, size, rises, along_y, is_point, found)
+    given, ways = (shape, corner, size, rises, along_y, is_point, found), []
+    if not is_constant(beside) or beside:
+        ways.append(_beside_axis(*given))
+    if not is_constant(beside) or not beside:
+        ways.append(_under_face(*given))
+    normal, depth, seat = ways[0]
+    if len(ways) > 1:
+        normal, seat = (
+            Vector(select(beside, a, b) for a, b in zip(ways[0][n], ways[1][n], strict=True)) for n in (0, 2)
+        )
+        depth = select(beside, depth, ways[1][1])
     return Touch(Surface(normal, select(there, depth, AWAY), cell, near), seat)
 
 
@@ -96,9 +109,9 @@ def _under_face(
 
 
 def _beside_axis(
-    shape: Shape, corner: Vector, size: Value, rises: Value, along_y: Value, is_point: Value, sign: Value
+    shape: Shape, corner: Vector, size: Value, rises: Value, along_y: Value, is_point: Value, found: list[Scalar]
 ) -> tuple[Vector, Value, Vector]:
-    """Return normal, depth and place of a grid point or a line beside the axis of a capsule."""
+    """Return normal, depth and place of a grid point or a line beside the axis of a capsule or a cylinder."""
     axis, w = shape.axes[2], shape.centre - corner
     g = Vector((select(along_y, 0.0, size), select(along_y, size, 0.0), rises))
     along, both, square, of_line = dot(axis, w), dot(axis, g), dot(g, g), dot(g, w)
@@ -108,9 +121,9 @@ def _beside_axis(
     away = w + axis * t - g * s
     squares = dot(away, away)
     known = less(0.0, squares)
-    inverse = sign * inverse_root(select(known, squares, 1.0))
+    inverse = found[0] * inverse_root(select(known, squares, 1.0))
     normal = Vector(select(known, x * inverse, y) for x, y in zip(away, (0.0, 0.0, 1.0), strict=True))
-    radius = shape.sizes[0]
+    radius = shape.sizes[0] if shape.kind == CAPSULE_GRID else shape.sizes[0] + shape.radius
     return normal, radius - squares * inverse, axis * t - normal * radius
 
 

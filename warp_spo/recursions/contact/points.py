@@ -332,7 +332,7 @@ def _shape_over(
     axes, sizes, _ = _support_values(trace, number)
     centre = Vector(x - place.origin[c] - ground.origin[c] for c, x in enumerate(middle))
     turned = [Vector(dot(way, axis) for way in toward) for axis in axes]
-    return Shape(support.kind, centre, turned, sizes, radius)
+    return Shape(support.kind, centre, turned, sizes, radius, support.table)
 
 
 def _place_support(trace: Trace, number: int, normal: Vector) -> SupportPlacement:
