@@ -40,9 +40,10 @@ class ShapeArguments(StoredPart):
     """A body, and the argument that gives its contact shape.
 
     A ``point`` is one point. A ``sphere`` touches the ground with its lowest point, which moves over the sphere as the
-    body turns, and so does an ``ellipsoid``. A ``capsule`` is the two spheres at its ends; a ``box`` its eight corners;
-    a ``cylinder`` and a ``cone`` the lowest points of both rims, or of the rim and the tip, and two points beside the
-    lower one, 120 degrees along the rim; a ``hull`` those of its points that lie on the convex hull.
+    body turns, and so does an ``ellipsoid``. A ``capsule`` is the two spheres at its ends; a ``box`` the four corners of
+    the face that looks down; a ``cylinder`` and a ``cone`` the lowest points of both rims, or of the rim and the tip, and two points beside the
+    lower one, 120 degrees along the rim; a ``hull`` those of its points that lie on the convex hull. On a height field
+    all but points, spheres, cones and ellipsoids touch its grid, too.
 
     Args:
         body: index of the body.
