@@ -353,7 +353,7 @@ class ContactStep:
             which = int(field[0]) if len(field) else 0
             middle = (dense.body_matrix[point.body] @ homogeneous([*point.position, 0, 0, 0, 1]))[:3, 3]
             up = np.array(ground.normal if plane else (0.0, 0.0, 1.0))
-            if point.support is not None and not plane and point.support.kind != "corner":
+            if point.support is not None and not plane and point.support.kind not in ("corner", "hull corner"):
                 up = upward(ground, middle - moved, which)
             grid = self._grid_touch(point, middle, moved, which)
             seat, hub, more = self._support_place(point, up, path) if grid is None else (grid[2], grid[2], 0.0)
@@ -379,6 +379,9 @@ class ContactStep:
                 touches = nearest_points(ground, at - moved, point.radius, which, point.walls and self._touches_twice)
             else:
                 touches = surfaces(ground, at - moved, which, moves, point.walls)
+            if point.support is not None and grid is None:
+                there = point.support.is_there(dense.body_matrix[point.body][:3, :3].T @ up)
+                touches = [(normal, depth if there else AWAY) for normal, depth in touches]
             for normal, depth in touches:
                 at = centre - point.radius * normal if rolls else at
                 J, bend = dense._jacobian_at(point.body, at), normal @ bending + more

@@ -14,13 +14,14 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from ..errors import UnsupportedError
+from ..reference.hull_corners import ROWS
 from .checks import checked_array, read_only
 from .extreme_points import extreme_points, farthest_points, spread_directions
 from .frames import pose_matrix
 from .hulls import Hull, convex_hull, grown, is_convex, with_corners
 from .parts import IDENTITY_POSE, checked_pose
 from .pickling import StoredPart
-from .supports import BOX_GRID, CAPSULE_GRID, CORNER, CYLINDER_GRID, HULL_GRID, RIM, SURFACE, Support
+from .supports import BOX_GRID, CAPSULE_GRID, CORNER, CYLINDER_GRID, HULL_CORNER, HULL_GRID, RIM, SURFACE, Support
 
 SWEPT_SEGMENT, BOX, HULL = 0, 1, 2
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])  # of a cube
@@ -40,10 +41,11 @@ class ShapeArguments(StoredPart):
     """A body, and the argument that gives its contact shape.
 
     A ``point`` is one point. A ``sphere`` touches the ground with its lowest point, which moves over the sphere as the
-    body turns, and so does an ``ellipsoid``. A ``capsule`` is the two spheres at its ends; a ``box`` the four corners of
-    the face that looks down; a ``cylinder`` and a ``cone`` the lowest points of both rims, or of the rim and the tip, and two points beside the
-    lower one, 120 degrees along the rim; a ``hull`` those of its points that lie on the convex hull. On a height field
-    all but points, spheres, cones and ellipsoids touch its grid, too.
+    body turns, and so does an ``ellipsoid``. A ``capsule`` is the two spheres at its ends; a ``box`` the four corners
+    of the face that looks down; a ``cylinder`` and a ``cone`` the lowest points of both rims, or of the rim and the
+    tip, and two points beside the lower one, 120 degrees along the rim; a ``hull`` those of its points that lie on the
+    convex hull, or of more than eight the lowest and up to seven around it. On a height field boxes, capsules,
+    cylinders and hulls touch its grid, too.
 
     Args:
         body: index of the body.
@@ -504,6 +506,15 @@ class HullShape(ContactShape):
 
     def ground_points(self) -> tuple[np.ndarray, float]:
         return self._corners, 0.0
+
+    def supports(self) -> tuple[np.ndarray, float, list[Support]]:
+        corners = self._corners
+        if len(corners) <= ROWS:
+            return super().supports()
+        middle, (x, y, z) = (corners.min(axis=0) + corners.max(axis=0)) / 2.0, np.ptp(corners, axis=0) / 2.0
+        axes, table = tuple(map(tuple, np.eye(3).tolist())), tuple((corners - middle).ravel().tolist())
+        sizes = float(x), float(y), float(z)
+        return middle, 0.0, [Support(HULL_CORNER, axes, sizes, number, table) for number in range(ROWS)]
 
     @functools.cached_property
     def _grid_supports(self) -> tuple[np.ndarray, list[Support]]:

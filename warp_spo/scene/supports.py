@@ -10,9 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-CORNER, RIM, SURFACE = "corner", "rim", "surface"
+from ..reference.hull_corners import choose
+
+CORNER, RIM, SURFACE, HULL_CORNER = "corner", "rim", "surface", "hull corner"
 """Corners of the face of a box that looks down; points on the rims of a cylinder or a cone; the lowest of an
-ellipsoid."""
+ellipsoid; lowest corners of a hull, see :mod:`warp_spo.reference.hull_corners`."""
 BOX_GRID, CAPSULE_GRID, HULL_GRID, CYLINDER_GRID = "box grid", "capsule grid", "hull grid", "cylinder grid"
 """Where a shape touches points and lines of a height field's grid, see :mod:`warp_spo.reference.field_grid`."""
 GRIDS = {BOX_GRID: ("box", 4), CAPSULE_GRID: ("capsule", 2), HULL_GRID: ("hull", 4), CYLINDER_GRID: ("cylinder", 4)}
@@ -61,7 +63,14 @@ class Support(NamedTuple):
     def offset(self, normal: Any) -> np.ndarray:
         """Return where the point is from the shape's middle [m]; ``normal`` of the ground and result in the body."""
         axes = np.array(self.axes)
+        if self.kind == HULL_CORNER:
+            corners = np.reshape(self.table, (-1, 3))
+            return corners[choose(corners, normal)[0][self.number]]
         return axes.T @ OFFSETS[self.kind](axes @ np.asarray(normal), np.array(self.sizes), self.number)
+
+    def is_there(self, normal: Any) -> bool:
+        """Return whether the point counts: of corners of a hull, whether no earlier one is the same."""
+        return self.kind != HULL_CORNER or bool(choose(np.reshape(self.table, (-1, 3)), normal)[1][self.number])
 
 
 def _corner(n: np.ndarray, half: np.ndarray, number: int) -> np.ndarray:

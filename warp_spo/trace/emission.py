@@ -33,7 +33,7 @@ COST = {  # floating-point operations of a statement
     "search": 1,
     "floor": 1,
 }
-SEARCHED = 20  # numbers of a search, before what a shape lists
+SEARCHED, NORMAL = 20, 3  # numbers of a search in a field or over a plane, before what a shape lists
 COST_ELSE = 8  # of the other statements: sines, roots and reciprocals take about as long as 8 additions
 
 
@@ -359,15 +359,17 @@ class Emitter:
     def _search_statements(self, scalar: Scalar, step: str) -> list[str]:
         """Return the statements of all numbers that a search finds."""
         (table, shape, count, _, *values), T = scalar.args, C_TYPE[self.dtype]
-        found, own = search(scalar.graph, table, shape, values, count), values[SEARCHED:]  # a table of the shape's own
-        asked = ", ".join(map(self._text, values[:SEARCHED]))
+        size = SEARCHED if table else NORMAL
+        found, own = search(scalar.graph, table, shape, values, count), values[size:]  # a table of the shape's own
+        asked = ", ".join(map(self._text, values[:size]))
         names = [self._name(each, step) for each in found]
         row, more = f"{names[0]}_row", ""
-        lines = [f"const {T} {names[0]}_asked[{SEARCHED}] = {{{asked}}};", f"{T} {row}[{count}];"]
+        lines = [f"const {T} {names[0]}_asked[{size}] = {{{asked}}};", f"{T} {row}[{count}];"]
         if own:
             listed, more = ", ".join(literal(x, self.dtype) for x in own), f"{names[0]}_of, {len(own)}, "
             lines.append(f"static const {T} {names[0]}_of[{len(own)}] = {{{listed}}};")
-        lines.append(f"grid_search::{shape}({table}.data, {names[0]}_asked, {more}{row});")
+        first = f"grid_search::{shape}({table}.data, " if table else f"hull_corners::{shape}("
+        lines.append(f"{first}{names[0]}_asked, {more}{row});")
         return [*lines, *(f"const {T} {name} = {row}[{i}];" for i, name in enumerate(names))]
 
     def _fused_statement(self, scalar: Scalar, product: Scalar, step: str) -> list[str]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..reference import field_grid
+from ..reference import field_grid, hull_corners
 from .scalars import BRANCHES, Scalar, Value, is_constant, ordered
 
 CORNERS = 4  # numbers of a row of the table in which a search finds heights
@@ -66,7 +66,8 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
             key = (table, shape, *asked)
             if key not in searches:
                 numbers = [np.asarray(x if is_constant(x) else values[x.key]) for x in asked]
-                searches[key] = _search(shape, np.asarray(load(table, ())), np.broadcast_arrays(*numbers))
+                cells = np.asarray(load(table, ())) if table else None
+                searches[key] = _search(shape, cells, np.broadcast_arrays(*numbers))
             values[scalar.key] = np.asarray(searches[key][..., column], dtype=dtype)
         else:
             args = []
@@ -79,12 +80,16 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
     return [np.asarray(o, dtype=dtype) if is_constant(o) else values[o.key] for o in outputs]
 
 
-def _search(shape: str, cells: np.ndarray, numbers: list[np.ndarray]) -> np.ndarray:
-    """Return the numbers [..., number] that a search finds in the cells [entry] or [world, entry]."""
+def _search(shape: str, cells: np.ndarray | None, numbers: list[np.ndarray]) -> np.ndarray:
+    """Return the numbers [..., number] that a search finds in the cells [entry] or [world, entry], or without any."""
     asked = np.stack(numbers, axis=-1)
     worlds = asked.reshape(-1, asked.shape[-1])
-    found = [
-        field_grid.find(shape, (cells if cells.ndim == 1 else cells[at])[::CORNERS], one).ravel()
-        for at, one in enumerate(worlds)
-    ]
+    found = (
+        [hull_corners.find(one).ravel() for one in worlds]
+        if cells is None
+        else [
+            field_grid.find(shape, (cells if cells.ndim == 1 else cells[at])[::CORNERS], one).ravel()
+            for at, one in enumerate(worlds)
+        ]
+    )
     return np.reshape(found, (*asked.shape[:-1], -1))

@@ -287,7 +287,8 @@ def entry(graph: Graph, table: str, place: Value, step: int) -> Scalar:
 def search(graph: Graph, table: str, shape: str, values: Iterable[Value], count: int) -> list[Scalar]:
     """Return ``count`` numbers that :mod:`warp_spo.reference.field_grid` finds for a shape in a table of cells.
 
-    They are discrete, and have no derivatives.
+    They are discrete, and have no derivatives. Without a ``table`` they are the corners of a hull that
+    :mod:`warp_spo.reference.hull_corners` finds.
     """
     values = tuple(values)
     return [graph.make("search", table, shape, count, column, *values) for column in range(count)]

@@ -32,7 +32,7 @@ from ...scene.contact_values import TURNING_VALUES
 from ...scene.contacts import PUSH_OUT, ContactPoint
 from ...scene.ground import AWAY, HEIGHTS, PLACE, HeightField, Listed
 from ...scene.scene import Scene
-from ...scene.supports import CORNER
+from ...scene.supports import CORNER, HULL_CORNER
 from ...trace.scalars import Entry, Value, absolute, branch, is_constant, less, lost, reciprocal, select
 from ...trace.spatial import IDENTITY, ZERO, Twist, Vector, cross, dot, total
 from ..kinematics import arm_on_link, carried_velocity, frame_on_link, zero
@@ -47,7 +47,7 @@ from ..step.joint_laws import is_number
 from .field_grid import ROW, Shape, Touch, find, touch
 from .field_spheres import ring, sphere_surfaces
 from .ground import Corners, GroundOffset, Surface, directions, has_walls, lowest, surface_count, surfaces, upward
-from .supports import SupportPlacement, place_support
+from .supports import SupportPlacement, hull_corners, place_support
 from .turning import TurningFriction, turning_names, turning_scales
 from .velocity_kicks import KICK, PATH
 
@@ -179,6 +179,7 @@ def place_points(
     base = ContactLinkMotion(asked, [0.0] * count, still, None, still, still)
     carried = _carry_outward(trace, base, needed, qd, path, carry)
     found, searches = [], dict[int, tuple[Shape, list[Value]]]()  # by contact
+    corners: dict[int, list[SupportPlacement]] = {}  # of hulls, likewise
     for number, (on, centre) in seats.items():
         point, mine = scene.contact_points[number], carried[None if on is None else id(on)]
         radius, eps, weight = point.radius, point.eps, weights[number]
@@ -191,6 +192,7 @@ def place_points(
         lever = radius + total(absolute(x) for x in centre)
         hub, more = centre, None
         grid: Touch | None = None
+        there: Value = 1.0
         if point.meets_grid:
             assert isinstance(ground, HeightField)
             if point.contact not in searches:
@@ -207,11 +209,18 @@ def place_points(
             )
             hub = centre
         elif point.support is not None:
-            if isinstance(ground, HeightField) and point.support.kind != CORNER:
+            if isinstance(ground, HeightField) and point.support.kind not in (CORNER, HULL_CORNER):
                 at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
                 up = upward(trace.graph, ground, at, place_of_ground)
                 down = Vector(total(n * axis[c] for n, axis in zip(up, toward, strict=True)) for c in range(3))
-            placed = _place_support(trace, number, down)
+            if point.support.kind == HULL_CORNER:
+                if point.contact not in corners:
+                    axes, _, _ = _support_values(trace, number)
+                    corners[point.contact] = hull_corners(trace.graph, point.support, axes, down)
+                placed = corners[point.contact][point.support.number]
+            else:
+                placed = _place_support(trace, number, down)
+            there = placed.there
             lever, more = lever + point.support.reach, placed.bend(mine.travel, mine.bend)
             centre, hub = centre + placed.offset, centre + placed.hub
         arm = centre if rolls or grid or is_number(radius, 0.0) else centre - down * radius
@@ -241,6 +250,7 @@ def place_points(
         for normal, depth, cell, near in touched:
             inward = Vector(total(n * axis[c] for n, axis in zip(normal, toward, strict=True)) for c in range(3))
             arm = centre - inward * radius if rolls else arm
+            depth = select(there, depth, AWAY)
             faster = h * (dot(inward, bend) if more is None else dot(inward, bend) + more)
             if half_way:  # half a step back, along a parabola
                 depth = depth + (0.5 * h) * dot(inward, v + cross(w, arm)) - (0.125 * h) * faster
