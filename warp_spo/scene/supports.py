@@ -57,8 +57,8 @@ class Support(NamedTuple):
         a, b, c = self.sizes
         if self.kind == CAPSULE_GRID:
             return a + c
-        box = np.hypot(np.hypot(a, b), c)
-        return {RIM: np.hypot(max(a, b), c), SURFACE: max(a, b, c)}.get(self.kind, box)
+        box = float(np.hypot(np.hypot(a, b), c))
+        return {RIM: float(np.hypot(max(a, b), c)), SURFACE: max(a, b, c)}.get(self.kind, box)
 
     def offset(self, normal: Any) -> np.ndarray:
         """Return where the point is from the shape's middle [m]; ``normal`` of the ground and result in the body."""

@@ -65,9 +65,9 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
             table, shape, _, column, *asked = scalar.args
             key = (table, shape, *asked)
             if key not in searches:
-                numbers = [np.asarray(x if is_constant(x) else values[x.key]) for x in asked]
+                given = [np.asarray(x if is_constant(x) else values[x.key]) for x in asked]
                 cells = np.asarray(load(table, ())) if table else None
-                searches[key] = _search(shape, cells, np.broadcast_arrays(*numbers))
+                searches[key] = _search(shape, cells, np.stack(np.broadcast_arrays(*given), axis=-1))
             values[scalar.key] = np.asarray(searches[key][..., column], dtype=dtype)
         else:
             args = []
@@ -80,9 +80,11 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
     return [np.asarray(o, dtype=dtype) if is_constant(o) else values[o.key] for o in outputs]
 
 
-def _search(shape: str, cells: np.ndarray | None, numbers: list[np.ndarray]) -> np.ndarray:
-    """Return the numbers [..., number] that a search finds in the cells [entry] or [world, entry], or without any."""
-    asked = np.stack(numbers, axis=-1)
+def _search(shape: str, cells: np.ndarray | None, asked: np.ndarray) -> np.ndarray:
+    """Return the numbers [..., number] that a search which is ``asked`` [..., number] finds in the cells, or without any.
+
+    The cells are [entry] or [world, entry].
+    """
     worlds = asked.reshape(-1, asked.shape[-1])
     found = (
         [hull_corners.find(one).ravel() for one in worlds]

@@ -37,7 +37,7 @@ class Shape(NamedTuple):
     table: tuple[float, ...] = ()
 
 
-class Touch(NamedTuple):
+class GridPlace(NamedTuple):
     """Where a shape touches the grid: the surface there, and the place on the shape from its middle, inertial axes."""
 
     surface: Surface
@@ -57,7 +57,7 @@ def find(graph: Graph, ground: HeightField, place: GroundOffset, shape: Shape) -
 
 def touch(
     graph: Graph, ground: HeightField, place: GroundOffset, shape: Shape, row: list[Scalar], near: Value
-) -> Touch:
+) -> GridPlace:
     """Return where the shape touches what a row of :func:`find` names; ``near`` as of a surface that is always near."""
     kind, i, j, *found = row
     there = less(NONE, kind)
@@ -81,7 +81,7 @@ def touch(
             Vector(select(beside, a, b) for a, b in zip(ways[0][n], ways[1][n], strict=True)) for n in (0, 2)
         )
         depth = select(beside, depth, ways[1][1])
-    return Touch(Surface(normal, select(there, depth, AWAY), cell, near), seat)
+    return GridPlace(Surface(normal, select(there, depth, AWAY), cell, near), seat)
 
 
 def _under_face(

@@ -44,7 +44,7 @@ from ..model.tracing import Trace
 from ..motion import VelocityTerms, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
 from ..step.joint_laws import is_number
-from .field_grid import ROW, Shape, Touch, find, touch
+from .field_grid import ROW, Shape, GridPlace, find, touch
 from .field_spheres import ring, sphere_surfaces
 from .ground import Corners, GroundOffset, Surface, directions, has_walls, lowest, surface_count, surfaces, upward
 from .supports import SupportPlacement, hull_corners, place_support
@@ -191,7 +191,7 @@ def place_points(
         down = toward[lowest(ground)]
         lever = radius + total(absolute(x) for x in centre)
         hub, more = centre, None
-        grid: Touch | None = None
+        grid: GridPlace | None = None
         there: Value = 1.0
         if point.meets_grid:
             assert isinstance(ground, HeightField)
