@@ -163,7 +163,7 @@ def depths_on(name: str, kind: str, lean: float, count: int, seed: int = 0) -> I
     field, width = fields()[name]
     poses, depths = placed(field, width, SHAPES[kind], lean, count, seed)
     found = found_depths(field, SHAPES[kind], poses)
-    motion = f"{kind} leaning by up to {np.degrees(lean):.0f} degrees, {name}"
+    motion = f"{kind} leaning by up to {np.degrees(lean):.0f} degrees, {name}, {count} places"
     yield Line(motion, "missed, of 1 mm and deeper", None, float(((depths >= SEEN) & (found <= 0.0)).mean()), 0.0)
     yield Line(motion, "depths off by more than 1 mm", None, float((abs(found - depths) > CLOSE).mean()), 0.05)
 

@@ -81,9 +81,9 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
 
 
 def _search(shape: str, cells: np.ndarray | None, asked: np.ndarray) -> np.ndarray:
-    """Return the numbers [..., number] that a search which is ``asked`` [..., number] finds in the cells, or without any.
+    """Return the numbers [..., number] that a search finds which is ``asked`` so [..., number].
 
-    The cells are [entry] or [world, entry].
+    ``cells``: in which it looks, [entry] or [world, entry]; None: it needs none.
     """
     worlds = asked.reshape(-1, asked.shape[-1])
     found = (

@@ -44,7 +44,7 @@ from ..model.tracing import Trace
 from ..motion import VelocityTerms, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
 from ..step.joint_laws import is_number
-from .field_grid import ROW, Shape, GridPlace, find, touch
+from .field_grid import ROW, GridPlace, Shape, find, touch
 from .field_spheres import ring, sphere_surfaces
 from .ground import Corners, GroundOffset, Surface, directions, has_walls, lowest, surface_count, surfaces, upward
 from .supports import SupportPlacement, hull_corners, place_support
