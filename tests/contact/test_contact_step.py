@@ -148,7 +148,11 @@ def on_grounds(ground, values):
     scene = box(ground=ground)
     moved = np.random.default_rng(4).uniform(-0.1, 0.1, (WORLDS, 3))
     scene = scene.with_values(ground_origin=np.float64(np.float32(moved)), **values)
-    rng, q, qd = np.random.default_rng(5), np.zeros((WORLDS, 7)), np.random.default_rng(6).normal(size=(WORLDS, 6))
+    rng, q, qd = (
+        np.random.default_rng(5),
+        np.zeros((WORLDS, 7)),
+        0.3 * np.random.default_rng(6).normal(size=(WORLDS, 6)),
+    )
     q[:, :2], q[:, 3:] = rng.uniform(-0.3, 0.3, (WORLDS, 2)), [0.1, 0.2, 0.0, 0.9]
     for world in range(WORLDS):
         for _ in range(6):  # until it is 5 mm deep
