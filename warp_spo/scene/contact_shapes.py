@@ -33,6 +33,7 @@ RING = 32  # points on a rim that stand for it
 SOME = 64  # directions in which corners of a mesh are looked for at first
 ROUNDING = 1e-15  # share of a shape's size by which an entry of a point that should be zero may differ
 Names = Mapping[str, tuple[str, ...]]
+AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # of a body
 FLAT = 1e-3  # half the least size of a box that is drawn [m]
 
 
@@ -512,9 +513,9 @@ class HullShape(ContactShape):
         if len(corners) <= ROWS:
             return super().supports()
         middle, (x, y, z) = (corners.min(axis=0) + corners.max(axis=0)) / 2.0, np.ptp(corners, axis=0) / 2.0
-        axes, table = tuple(map(tuple, np.eye(3).tolist())), tuple((corners - middle).ravel().tolist())
+        table = tuple((corners - middle).ravel().tolist())
         sizes = float(x), float(y), float(z)
-        return middle, 0.0, [Support(HULL_CORNER, axes, sizes, number, table) for number in range(ROWS)]
+        return middle, 0.0, [Support(HULL_CORNER, AXES, sizes, number, table) for number in range(ROWS)]
 
     @functools.cached_property
     def _grid_supports(self) -> tuple[np.ndarray, list[Support]]:
@@ -522,9 +523,9 @@ class HullShape(ContactShape):
             hull, middle = convex_hull("", self.points, self._corners)
         except (ValueError, UnsupportedError):  # flat, or of more faces than all searches take
             return np.zeros(3), []
-        axes, half = tuple(map(tuple, np.eye(3).tolist())), np.ptp(hull.corners, axis=0) / 2.0
+        half = np.ptp(hull.corners, axis=0) / 2.0
         sizes = float(half[0]), float(half[1]), float(half[2])
-        return middle, [Support(HULL_GRID, axes, sizes, number, hull.grid_table) for number in range(4)]
+        return middle, [Support(HULL_GRID, AXES, sizes, number, hull.grid_table) for number in range(4)]
 
     def grid_supports(self) -> tuple[np.ndarray, list[Support]]:
         return self._grid_supports

@@ -194,7 +194,7 @@ def place_points(
         grid: GridPlace | None = None
         there: Value = 1.0
         if point.meets_grid:
-            assert isinstance(ground, HeightField)
+            assert isinstance(ground, HeightField) and point.support is not None
             if point.contact not in searches:
                 at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
                 shape = _shape_over(trace, number, ground, place_of_ground, at, toward, radius)
