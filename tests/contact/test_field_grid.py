@@ -64,9 +64,10 @@ def test_the_recursion_is_the_dense_step(kind, ground):
     assert_is_dense(scene, leaning(scene, 2, 4), 3)
 
 
-def test_the_kernel_is_the_dense_step():
-    """Native searches find what those of the specification do."""
-    scene = scene_of(*CONTACTS, ground="stairs")
+@pytest.mark.parametrize("kinds", [("box",), pytest.param(tuple(CONTACTS), marks=pytest.mark.slow)])
+def test_the_kernel_is_the_dense_step(kinds):
+    """Native searches find what those of the specification do; all shapes on one body, too."""
+    scene = scene_of(*kinds, ground="rough" if len(kinds) == 1 else "stairs")
     a = leaning(scene, 3, 24)
     dyn = spo.Dynamics(scene, worlds=24, dtype="float64", device="cpu")
     found = dyn.step(a["q"], a["qd"], dt=H)[1]
