@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import warp as wp
 
+from . import field_grid, hull_corners
 from .elementary import C_TYPE, NATIVE
 from .fields import copy_cached_fields, define_fields
 from .long_results import RELAY_WORLDS, WARP_SIZE, SlotLayout
@@ -204,7 +205,8 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
     """Return the native code of one thread, given its statements for CUDA and for the CPU."""
     c = C_TYPE[T]
     numbers = [f"const {c} {name}_row[1] = {{{name}}};" for name in layout.numbers]
-    text = [NATIVE[c], *numbers, "#if defined(__CUDA_ARCH__)", *_cuda_text(layout, cuda, T)]
+    found = field_grid.definitions(cpu, T) + hull_corners.definitions(cpu, T)
+    text = [NATIVE[c], *found, *numbers, "#if defined(__CUDA_ARCH__)", *_cuda_text(layout, cuda, T)]
     text += ["#else", *_cpu_text(layout, cpu, c), "#endif", "#undef SENT", "#undef RELAY"]
     return "\n".join([*text, *(["#undef FIELD"] if layout.fields else []), ""])
 

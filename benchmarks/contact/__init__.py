@@ -7,6 +7,7 @@
 ``motions`` and ``courses``: every figure that contacts promise, on a CPU. ``mujoco``: G1 beside MuJoCo, its error
 against run time. ``peers``: steps beside mujoco_warp and Newton's solvers, on a GPU. ``gradients``: their time, errors
 and jumps. ``terrain``: a picture of the kinds of terrain. ``shapes``: shapes on fields and planes beside truths.
-``narrow_phase``: points of every pair of convex shapes beside truths, and their time on a GPU. All
-but ``scenes`` and ``courses`` are commands.
+``narrow_phase``: points of every pair of convex shapes beside truths, and their time on a GPU.
+``uneven``: boxes and capsules on fields beside dense sampling, on a stair's edge and across a ridge. All but
+``scenes`` and ``courses`` are commands.
 """

@@ -1,7 +1,8 @@
 """Robots on the ground, and states in which they stand: Go2, G1 and an ant, on a plane or rough ground.
 
-Go2 has a sphere at each foot and the trunk's eight corners; G1 four points at each sole and ten points on its body.
-The ant is that of the tasks, with its capsules. Drives hold the joints with effort limits.
+Go2 has a sphere at each foot and a box at the trunk; G1 four points at each sole and ten points on its body. With
+"_boxes" after their names they have a box at each foot, and nothing else. The ant is that of the tasks, with its
+capsules. Drives hold the joints with effort limits.
 """
 
 from __future__ import annotations
@@ -20,6 +21,10 @@ from ..table import robots
 
 DT = 5e-3
 GO2_STAND = np.array([0.0, 0.8, -1.5] * 4)
+BOXES = {  # half the sizes of a foot [m], and its pose in the body
+    "go2": ((0.04, 0.025, 0.012), (0.0, 0.0, -0.01, 0.0, 0.0, 0.0, 1.0)),
+    "g1": ((0.09, 0.035, 0.012), (0.035, 0.0, -0.018, 0.0, 0.0, 0.0, 1.0)),
+}
 SOLE = [(x, y, -0.03) for x in (-0.05, 0.12) for y in (-0.03, 0.03)]
 
 
@@ -27,6 +32,7 @@ def scene(name: str) -> spo.Scene:
     """Return a robot on the ground, with drives; the ant has none."""
     if name == "ant":
         return env_robots.load(name).scene
+    name, _, boxes = name.partition("_")
     bare = robots.scene(name)
     labels = [label.split("/")[-1] for label in bare.body_labels]
     if name == "go2":
@@ -38,6 +44,10 @@ def scene(name: str) -> spo.Scene:
         body = [f"{side}_{part}" for side in ("left", "right") for part in
                 ("knee_link", "elbow_link", "rubber_hand", "hip_yaw_link", "shoulder_yaw_link")]  # fmt: skip
         contacts += [spo.Contact(labels.index(label), sphere=((0, 0, 0), 0.05)) for label in body if label in labels]
+    if boxes:
+        where = {"go2": "_foot", "g1": "_ankle_roll_link"}[name]
+        feet = [number for number, label in enumerate(labels) if label.endswith(where)]
+        contacts = [spo.Contact(foot, box=BOXES[name]) for foot in feet]
     free, n = 6, bare.dof_count
     drive = np.r_[np.zeros(free), np.ones(n - free)]
     gains = dict(joint_target_ke=60.0 * drive, joint_target_kd=2.0 * drive, joint_armature=0.01 * drive,

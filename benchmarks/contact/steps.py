@@ -81,7 +81,7 @@ def prepare(
 def main(arguments: list[str] | None = None) -> int:
     parser = command_line.parser("contact.steps", __doc__)
     parser.add_argument("--worlds", type=int, nargs="+", default=[4096, 65536])
-    parser.add_argument("--robots", nargs="+", default=["go2", "g1"], help="go2, g1, ant")
+    parser.add_argument("--robots", nargs="+", default=["go2", "g1"], help="go2, g1, ant, go2_boxes, g1_boxes")
     parser.add_argument("--granularity", nargs="+", default=["planned"], help="planned, tree, segment")
     parser.add_argument("--dtype", nargs="+", default=["float32"])
     parser.add_argument("--ground", nargs="+", choices=GROUNDS, default=["plane", "field"])

@@ -17,6 +17,8 @@ ROUND = {
     "cone": dict(cone=((0.1, 0.0, -0.05), (0.05, 0.02, 0.05), 0.06)),
     "ellipsoid": dict(ellipsoid=((0.1, 0.06, 0.03), POSE)),
 }
+STONE = np.random.default_rng(3).normal(size=(60, 3))
+STONE = STONE / np.linalg.norm(STONE, axis=1)[:, None] * (0.1, 0.06, 0.03)  # all of them on the hull
 TILTED = spo.Plane(0.1, (0.6, 0.0, 0.8))
 
 
@@ -57,7 +59,7 @@ def test_a_box_has_the_corners_of_the_face_that_looks_down():
     scene = box().with_contacts([spo.Contact(0, box=((0.1, 0.06, 0.03), POSE))], spo.Plane())
     corners, turn = scene.contacts[0].positions, pose_matrix(np.array(POSE))[:3, :3]
     assert len(corners) == 8 and len(scene.contact_points) == 4
-    assert len(scene.with_contacts(scene.contacts, FIELDS["rough"]).contact_points) == 8
+    assert len(scene.with_contacts(scene.contacts, FIELDS["rough"]).contact_points) == 8  # and four on the grid
     for normal in np.random.default_rng(0).normal(size=(50, 3)):
         normal /= np.linalg.norm(normal)
         places = np.array([point.place(normal) for point in scene.contact_points])
@@ -65,6 +67,41 @@ def test_a_box_has_the_corners_of_the_face_that_looks_down():
         along = (places - POSE[:3]) @ turn
         face = np.abs(normal @ turn).argmax()
         assert np.ptp(along[:, face]) < 1e-12 and len(np.unique(np.round(along, 9), axis=0)) == 4
+
+
+def test_a_hull_has_eight_corners_at_most():
+    """The lowest is the first; of those that lean by up to 2 degrees the lowest is among them; none twice."""
+    scene = box().with_contacts([spo.Contact(0, hull=STONE)], TILTED)
+    assert len(scene.contact_points) == 8 and len(scene.contacts[0].positions) == len(STONE)
+    ways = np.array([[np.cos(a), np.sin(a), 0.0] for a in 2.0 * np.pi * np.arange(7) / 7.0])
+    for normal in np.random.default_rng(0).normal(size=(50, 3)):
+        normal /= np.linalg.norm(normal)
+        there = [point.support.is_there(normal) for point in scene.contact_points]
+        places = np.array([point.place(normal) for point in scene.contact_points])
+        assert abs((places @ normal).min() - (STONE @ normal).min()) < 2e-6 and np.argmin(places @ normal) == 0
+        assert len(np.unique(np.round(places[there], 9), axis=0)) == sum(there)
+        across = ways - np.outer(ways @ normal, normal)
+        for way in normal + 0.01 * across:
+            assert (places[there] @ way).min() <= (STONE @ way).min() + 2e-3
+
+
+@pytest.mark.parametrize("ground", ["plane", *FIELDS])
+def test_the_recursion_of_a_hull_is_the_dense_step(ground):
+    scene = box().with_contacts(
+        [spo.Contact(0, hull=STONE, friction=0.4)], TILTED if ground == "plane" else FIELDS[ground]
+    )
+    a = above(scene, 4, 6)
+    a = {name: rows[:-1] for name, rows in a.items()} if ground == "plane" else a
+    assert_is_dense(scene, a, 3)
+
+
+def test_the_kernel_of_a_hull_is_the_dense_step():
+    scene = box().with_contacts([spo.Contact(0, hull=STONE, friction=0.4)], TILTED)
+    a = {name: rows[:-1] for name, rows in above(scene, 5, 9).items()}
+    dyn = spo.Dynamics(scene, worlds=8, dtype="float64", device="cpu")
+    for q, qd, rates in zip(a["q"], a["qd"], dyn.step(a["q"], a["qd"], dt=H)[1], strict=True):
+        wanted = ContactStep(scene, q, qd, H).run()[1].v
+        np.testing.assert_allclose(rates, wanted, atol=1e-9 * np.abs(wanted).max())
 
 
 @pytest.mark.parametrize("kind", ROUND)

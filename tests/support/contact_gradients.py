@@ -51,7 +51,7 @@ def trace_of(scene, names):
 def store(stores, known, found):
     """Evaluate stores into arrays by name; return the answers of all comparisons [world, comparison]."""
     outputs = [item.value for item in stores]
-    asked = [x for x in ordered(outputs) if x.op in ("less", "floor")]
+    asked = [x for x in ordered(outputs) if x.op in ("less", "floor", "search")]
     values = evaluate([*outputs, *asked], lambda name, at: known[name][(slice(None), *at)], "float64")
     for item, value in zip(stores, values, strict=False):
         found[item.array][(slice(None), *item.index)] = value

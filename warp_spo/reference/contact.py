@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .dense import Dense
+from .field_grid import find, touched
 from .field_spheres import nearest_points
 from .rotations import homogeneous
 from .supports import support_path
@@ -34,6 +35,7 @@ UNBOUNDED, UNLIMITED = 1e6, 1e10  # effort and velocity limits, position limits,
 HOLD = 300.0  # resistance of a velocity limit, in inertias over the step
 MIDPOINT_PASSES = 4  # passes from which on a step uses the midpoint scheme
 ITERATIONS = 2  # of as many passes each
+AWAY = -1e3  # depth of a surface that is not there [m]
 PUSH_OUT = 1.0  # speed [m/s] at most at which a point that is slow comes out of the ground
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
 LENGTH, LEAST_LENGTH = 0.1, 3e-5  # of a body that cannot turn, or whose point cannot move; what is too short to be one
@@ -351,15 +353,16 @@ class ContactStep:
             which = int(field[0]) if len(field) else 0
             middle = (dense.body_matrix[point.body] @ homogeneous([*point.position, 0, 0, 0, 1]))[:3, 3]
             up = np.array(ground.normal if plane else (0.0, 0.0, 1.0))
-            if point.support is not None and not plane:
+            if point.support is not None and not plane and point.support.kind not in ("corner", "hull corner"):
                 up = upward(ground, middle - moved, which)
-            seat, hub, more = self._support_place(point, up, path)
+            grid = self._grid_touch(point, middle, moved, which)
+            seat, hub, more = self._support_place(point, up, path) if grid is None else (grid[2], grid[2], 0.0)
             at = (dense.body_matrix[point.body] @ homogeneous([*seat, 0, 0, 0, 1]))[:3, 3]
             bending = dense.jacobian_bias(path, [(point.body, (*hub, 0, 0, 0, 1))])[0, :3]
             share = 0.5 if self.half_way else 1.0
             moves = share * self.h * dense.jacobian([(point.body, (*seat, 0, 0, 0, 1))])[0, :3] @ path
             centre, rolls = at, point.radius > 0.0 and not plane and point.support is None
-            at = at if rolls else at - point.radius * up
+            at = at if rolls or grid is not None else at - point.radius * up
             typical = point.place((0.0, 0.0, 1.0))
             there = self.neutral.jacobian([(point.body, (*typical, 0, 0, 0, 1))])[0]
             weight, turn_weight = (SLIP * np.trace(part @ inverse @ part.T) / 3.0 for part in (there[:3], there[3:]))
@@ -369,12 +372,17 @@ class ContactStep:
             turning = [dense.value(f"contact_{name}_friction")[number] for name in ("torsional", "rolling")]
             turning += [length, turn_weight]
             if plane:
-                touched = [(np.array(ground.normal), ground.height - (at - moved) @ ground.normal)]
+                touches = [(np.array(ground.normal), ground.height - (at - moved) @ ground.normal)]
+            elif grid is not None:
+                touches = [grid[:2]]
             elif rolls:
-                touched = nearest_points(ground, at - moved, point.radius, which, point.walls and self._touches_twice)
+                touches = nearest_points(ground, at - moved, point.radius, which, point.walls and self._touches_twice)
             else:
-                touched = surfaces(ground, at - moved, which, moves, point.walls)
-            for normal, depth in touched:
+                touches = surfaces(ground, at - moved, which, moves, point.walls)
+            if point.support is not None and grid is None:
+                there = point.support.is_there(dense.body_matrix[point.body][:3, :3].T @ up)
+                touches = [(normal, depth if there else AWAY) for normal, depth in touches]
+            for normal, depth in touches:
                 at = centre - point.radius * normal if rolls else at
                 J, bend = dense._jacobian_at(point.body, at), normal @ bending + more
                 if self.half_way:  # half a step back
@@ -386,6 +394,25 @@ class ContactStep:
                 rows.append((J[:3], normal, depth, k, damping, mu, point.eps, weight, bend, J[3:], turning))
                 self.numbers.append(number)
         return Points(*(np.array(column) for column in zip(*rows, strict=True)))
+
+    def _grid_touch(self, point, middle, moved, which):
+        """Return normal, depth and place in the body of a point that touches a field's grid; None: of another one.
+
+        ``middle``: of its shape. It is AWAY where the search found nothing.
+        """
+        support, ground = point.support, self.scene.ground
+        if support is None or not support.meets_grid:
+            return None
+        pose, start, cell = self.dense.body_matrix[point.body], np.array(ground.origin) + moved, np.array(ground.cells)
+        axes, shape = np.array(support.axes) @ pose[:3, :3].T, support.kind.partition(" ")[0]
+        heights = ground.heights.reshape(-1, *ground.heights.shape[-2:])
+        numbers = [which * heights[0].size, *(middle - start), *axes.ravel(), *support.sizes, *cell, *heights[0].shape]
+        numbers += support.table
+        row = find(shape, heights.ravel(), numbers)[support.number]
+        found = touched(shape, heights[which], cell, middle - start, axes, support.sizes, point.radius, row)
+        if found is None:
+            return np.array([0.0, 0.0, 1.0]), AWAY, np.array(point.position)
+        return *found[:2], pose[:3, :3].T @ (found[2] + start - pose[:3, 3])
 
     def _support_place(self, point, up, path):
         """Return a point that moves over its shape, the material one whose path counts, and its further bend.

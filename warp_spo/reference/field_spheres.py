@@ -13,27 +13,40 @@ def nearest_points(field, centre, radius, number=0, both=True):
     by more than 20 degrees, unless the centre is below the surface. Of a set of fields it is that of this number.
     """
     h, cell = field.heights.reshape(-1, *field.heights.shape[-2:])[number], np.array(field.cells)
-    at = np.clip((centre[:2] - np.array(field.origin[:2])) / cell, 0.0, np.array(h.shape) - 1.0)
-    z, middle = centre[2] - field.origin[2], np.floor(at + 0.5)
-    cells = 1 if REACH * radius <= 0.5 * cell.min() else 2
+    start = centre - np.array(field.origin)
+    ring = 1 if REACH * radius <= 0.5 * cell.min() else 2
+    *cells, there = find_cells(h, start, cell, ring, both)
+    at = np.clip(start[:2] / cell, 0.0, np.array(h.shape) - 1.0)
+    chosen = [np.array(cells[:2], dtype=int), np.array(cells[2:], dtype=int)][: 2 if both and there else 1]
+    surfaces = [_foot(h[i : i + 2, j : j + 2], (at - (i, j)) * cell, start[2], cell, STEPS + 1) for i, j in chosen]
+    above = surfaces[0][1]
+    signed = [(up if above else -up, np.linalg.norm(up) if above else -np.linalg.norm(up)) for up, _ in surfaces]
+    return [(up / abs(distance), radius - distance) for up, distance in signed]
+
+
+def find_cells(heights, centre, cell, ring, both):
+    """Return i, j of the cell that is nearest to a centre, of the second one, and whether that is there.
+
+    Args:
+        heights: of one field [i, j]. centre: from its first point [m]. ring: how many cells to each side are tried.
+    """
+    most = np.array(heights.shape) - 1
+    at = np.clip(centre[:2] / cell, 0.0, most) if np.isfinite(centre).all() else np.zeros(2)
     found = []
-    for i in range(-cells, cells):
-        for j in range(-cells, cells):
-            first = np.clip(middle + np.array((i, j)), 0, np.array(h.shape) - 2).astype(int)
-            corners = h[first[0] : first[0] + 2, first[1] : first[1] + 2]
-            found.append((corners, (at - first) * cell))
-    feet = [_foot(*each, z, cell, STEPS) for each in found]
+    for i in range(-ring, ring):
+        for j in range(-ring, ring):
+            first = np.clip(np.floor(at + 0.5) + np.array((i, j)), 0, most - 1).astype(int)
+            corners = heights[first[0] : first[0] + 2, first[1] : first[1] + 2]
+            found.append((first, corners, (at - first) * cell))
+    feet = [_foot(*each[1:], centre[2], cell, STEPS) for each in found]
     best = int(np.argmin([away @ away for away, _ in feet]))
-    surfaces = [_foot(*found[best], z, cell, STEPS + 1)]
-    away, above = surfaces[0]
+    away, above = _foot(*found[best][1:], centre[2], cell, STEPS + 1)
     far = [
         other @ other if up and other @ away < APART * np.linalg.norm(other) * np.linalg.norm(away) else np.inf
         for other, up in feet
     ]
-    if both and above and np.isfinite(min(far)):
-        surfaces.append(_foot(*found[int(np.argmin(far))], z, cell, STEPS + 1))
-    signed = [(up if above else -up, np.linalg.norm(up) if above else -np.linalg.norm(up)) for up, above in surfaces]
-    return [(up / abs(distance), radius - distance) for up, distance in signed]
+    there = bool(both and above and np.isfinite(min(far)))
+    return [*found[best][0], *(found[int(np.argmin(far))][0] if there else (0, 0)), float(there)]
 
 
 def _foot(corners, inside, z, cell, steps):

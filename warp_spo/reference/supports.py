@@ -8,14 +8,14 @@ def support_path(support, turn, up, w, change):
 
     The lowest point of an ellipsoid is f = |A n| below the middle, with A the half axes and n the plane's normal in the
     body; that changes by f'' as n' = n x w does. A point on a rim turns as the cylinder's axis does, without the part
-    of ``w`` about it. Corners are material points.
+    of ``w`` about it. Corners of boxes and hulls are material points.
 
     Args:
         turn: of the body [3, 3]. up: the ground's normal. w, change: angular velocity and acceleration (3,).
     """
     offset = turn @ support.offset(turn.T @ up)
     axes, sizes = np.array(support.axes) @ turn.T, np.array(support.sizes)
-    if support.kind == "corner":
+    if support.kind in ("corner", "hull corner"):
         return offset, 0.0
     if support.kind == "rim":
         hub = axes[2] * (axes[2] @ offset)

@@ -47,7 +47,7 @@ def warn_of_soft_contacts(call: str, scene: Any, neutral: NeutralPose) -> None:
     """
     found: list[tuple[int, int, float, float]] = []
     points = scene.contact_points
-    of_tree = neutral.roots[[point.body for point in points]] if points else np.zeros(0)
+    of_tree = neutral.roots[[point.body for point in points if not point.meets_grid]] if points else np.zeros(0)
     for row, index in enumerate(one.contact for one in (*points, *scene.contact_pairs)):
         contact = scene.contacts[index]
         if contact.stiffness is None or contact.body not in neutral.flying:

@@ -14,13 +14,14 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from ..errors import UnsupportedError
+from ..reference.hull_corners import ROWS
 from .checks import checked_array, read_only
 from .extreme_points import extreme_points, farthest_points, spread_directions
 from .frames import pose_matrix
 from .hulls import Hull, convex_hull, grown, is_convex, with_corners
 from .parts import IDENTITY_POSE, checked_pose
 from .pickling import StoredPart
-from .supports import CORNER, RIM, SURFACE, Support
+from .supports import BOX_GRID, CAPSULE_GRID, CORNER, CYLINDER_GRID, HULL_CORNER, HULL_GRID, RIM, SURFACE, Support
 
 SWEPT_SEGMENT, BOX, HULL = 0, 1, 2
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])  # of a cube
@@ -32,6 +33,7 @@ RING = 32  # points on a rim that stand for it
 SOME = 64  # directions in which corners of a mesh are looked for at first
 ROUNDING = 1e-15  # share of a shape's size by which an entry of a point that should be zero may differ
 Names = Mapping[str, tuple[str, ...]]
+AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # of a body
 FLAT = 1e-3  # half the least size of a box that is drawn [m]
 
 
@@ -40,9 +42,11 @@ class ShapeArguments(StoredPart):
     """A body, and the argument that gives its contact shape.
 
     A ``point`` is one point. A ``sphere`` touches the ground with its lowest point, which moves over the sphere as the
-    body turns, and so does an ``ellipsoid``. A ``capsule`` is the two spheres at its ends; a ``box`` its eight corners;
-    a ``cylinder`` and a ``cone`` the lowest points of both rims, or of the rim and the tip, and two points beside the
-    lower one, 120 degrees along the rim; a ``hull`` those of its points that lie on the convex hull.
+    body turns, and so does an ``ellipsoid``. A ``capsule`` is the two spheres at its ends; a ``box`` the four corners
+    of the face that looks down; a ``cylinder`` and a ``cone`` the lowest points of both rims, or of the rim and the
+    tip, and two points beside the lower one, 120 degrees along the rim; a ``hull`` those of its points that lie on the
+    convex hull, or of more than eight the lowest and up to seven around it. On a height field boxes, capsules,
+    cylinders and hulls touch its grid, too.
 
     Args:
         body: index of the body.
@@ -164,12 +168,16 @@ class ContactShape(StoredPart):
         """Return the points that touch the ground in the body frame [point, 3] [m], and the radius about each [m]."""
         raise NotImplementedError
 
-    def supports(self, on_field: bool = False) -> tuple[np.ndarray, float, list[Support]]:
+    def supports(self) -> tuple[np.ndarray, float, list[Support]]:
         """Return the middle of a shape whose points move over it (3,) [m], the radius about each, and these points.
 
-        None: the points stay where they are in the body. ``on_field``: on a height field, not a plane.
+        None: the points stay where they are in the body.
         """
         return np.zeros(3), 0.0, []
+
+    def grid_supports(self) -> tuple[np.ndarray, list[Support]]:
+        """Return the middle (3,) [m] of a shape that also touches the grid of a height field, and where it does so."""
+        return np.zeros(3), []
 
     def points_on_plane(self, normal: np.ndarray) -> np.ndarray:
         """Return the points that touch a plane with this normal, in the body frame [point, 3] [m]."""
@@ -304,6 +312,15 @@ class CapsuleShape(ContactShape):
     def ground_points(self) -> tuple[np.ndarray, float]:
         return self.ends, self.radius
 
+    def grid_supports(self) -> tuple[np.ndarray, list[Support]]:
+        half = (self.ends[1] - self.ends[0]) / 2.0
+        length = float(np.linalg.norm(half))
+        if length == 0.0 or self.radius == 0.0:
+            return np.zeros(3), []
+        axes = tuple(map(tuple, _axes_along(half / length).tolist()))
+        sizes = self.radius, 0.0, length
+        return self.ends.mean(axis=0), [Support(CAPSULE_GRID, axes, sizes, number) for number in range(2)]
+
     def on_ground(self, margin: float, most: int) -> list[ContactShape]:
         return [self.grown(margin)]
 
@@ -347,10 +364,15 @@ class BoxShape(ContactShape):
     def arguments(self) -> dict[str, Any]:
         return {"box": (self.half, self.pose)}
 
-    def supports(self, on_field: bool = False) -> tuple[np.ndarray, float, list[Support]]:
+    def supports(self) -> tuple[np.ndarray, float, list[Support]]:
+        return np.asarray(self.pose)[:3], 0.0, self._supports(CORNER)
+
+    def grid_supports(self) -> tuple[np.ndarray, list[Support]]:
+        return np.asarray(self.pose)[:3], self._supports(BOX_GRID)
+
+    def _supports(self, kind: str) -> list[Support]:
         axes = tuple(map(tuple, pose_matrix(self.pose)[:3, :3].T.tolist()))
-        corners = [] if on_field else [Support(CORNER, axes, tuple(self.half.tolist()), corner) for corner in range(4)]
-        return np.asarray(self.pose)[:3], 0.0, corners
+        return [Support(kind, axes, tuple(self.half.tolist()), number) for number in range(4)]
 
     def ground_points(self) -> tuple[np.ndarray, float]:
         return Placement(self.pose).points(CORNERS * self.half), 0.0
@@ -416,16 +438,19 @@ class CylinderShape(ContactShape):
         """Return the axes, one a row, and half the length."""
         half = (self.ends[1] - self.ends[0]) / 2.0
         length = float(np.linalg.norm(half))
-        axis = half / length
-        across = np.eye(3)[np.abs(axis).argmin()]
-        first = np.cross(across, axis) / np.linalg.norm(np.cross(across, axis))
-        return np.array([first, np.cross(axis, first), axis]), length
+        return _axes_along(half / length), length
 
-    def supports(self, on_field: bool = False) -> tuple[np.ndarray, float, list[Support]]:
+    def supports(self) -> tuple[np.ndarray, float, list[Support]]:
         (axes, half), (bottom, top) = self._frame(), self.radii
         rows = tuple(map(tuple, axes.tolist()))
         found = [Support(RIM, rows, (top, bottom, half), number) for number in range(max(2, min(4, self.most)))]
         return self.ends.mean(axis=0), self.margin, found
+
+    def grid_supports(self) -> tuple[np.ndarray, list[Support]]:
+        (axes, half), (radius, other) = self._frame(), self.radii
+        rows = tuple(map(tuple, axes.tolist()))
+        found = [Support(CYLINDER_GRID, rows, (radius, radius, half), number) for number in range(4)]
+        return self.ends.mean(axis=0), found if radius == other else []
 
     def ground_points(self) -> tuple[np.ndarray, float]:
         axes, _ = self._frame()
@@ -482,6 +507,28 @@ class HullShape(ContactShape):
 
     def ground_points(self) -> tuple[np.ndarray, float]:
         return self._corners, 0.0
+
+    def supports(self) -> tuple[np.ndarray, float, list[Support]]:
+        corners = self._corners
+        if len(corners) <= ROWS:
+            return super().supports()
+        middle, (x, y, z) = (corners.min(axis=0) + corners.max(axis=0)) / 2.0, np.ptp(corners, axis=0) / 2.0
+        table = tuple((corners - middle).ravel().tolist())
+        sizes = float(x), float(y), float(z)
+        return middle, 0.0, [Support(HULL_CORNER, AXES, sizes, number, table) for number in range(ROWS)]
+
+    @functools.cached_property
+    def _grid_supports(self) -> tuple[np.ndarray, list[Support]]:
+        try:
+            hull, middle = convex_hull("", self.points, self._corners)
+        except (ValueError, UnsupportedError):  # flat, or of more faces than all searches take
+            return np.zeros(3), []
+        half = np.ptp(hull.corners, axis=0) / 2.0
+        sizes = float(half[0]), float(half[1]), float(half[2])
+        return middle, [Support(HULL_GRID, AXES, sizes, number, hull.grid_table) for number in range(4)]
+
+    def grid_supports(self) -> tuple[np.ndarray, list[Support]]:
+        return self._grid_supports
 
     def surface_points(self, most: int) -> np.ndarray:
         points = self.points[farthest_points(self.points, most)] if len(self.points) else np.zeros((0, 3))
@@ -549,7 +596,7 @@ class EllipsoidShape(ContactShape):
     def arguments(self) -> dict[str, Any]:
         return {"ellipsoid": self}
 
-    def supports(self, on_field: bool = False) -> tuple[np.ndarray, float, list[Support]]:
+    def supports(self) -> tuple[np.ndarray, float, list[Support]]:
         axes = tuple(map(tuple, pose_matrix(self.pose)[:3, :3].T.tolist()))
         return np.asarray(self.pose)[:3], self.margin, [Support(SURFACE, axes, tuple(self.half.tolist()), 0)]
 
@@ -645,6 +692,13 @@ def _radius(call: str, name: str, value: Any) -> float:
 def _ring(count: int, radius: float) -> np.ndarray:
     angles = 2.0 * np.pi * np.arange(count) / count
     return radius * np.stack([np.cos(angles), np.sin(angles), np.zeros(count)], axis=1)
+
+
+def _axes_along(axis: np.ndarray) -> np.ndarray:
+    """Return three axes, one a row, of which the third is ``axis``."""
+    across = np.eye(3)[np.abs(axis).argmin()]
+    first = np.cross(across, axis) / np.linalg.norm(np.cross(across, axis))
+    return np.array([first, np.cross(axis, first), axis])
 
 
 def _from_z(axis: np.ndarray) -> tuple[float, ...]:

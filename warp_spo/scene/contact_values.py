@@ -40,6 +40,7 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
         for name, value in zip(CONTACT_VALUES, found, strict=False):
             values[name][0, i] = value
     bodies = np.array([point.body for point in points], dtype=int)
+    carrying = bodies[[not point.meets_grid for point in points]]  # others touch uneven ground, in place of these
     sinks = {}
     for body in dict.fromkeys(bodies.tolist()):
         mine = [contact for contact in scene.contacts if contact.other is None and contact.body == body]
@@ -47,7 +48,7 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
         sinks[body] = stand.sink(body, at, max(contact.radius for contact in mine))
     for i, point in enumerate(points):
         contact, load, mass = scene.contacts[point.contact], *stand.load(point.body)
-        rests = min(POINTS_AT_REST, int((stand.roots == stand.roots[point.body])[bodies].sum()))
+        rests = min(POINTS_AT_REST, int((stand.roots == stand.roots[point.body])[carrying].sum()))
         k = contact.stiffness
         if k is None:
             k = chosen_stiffness(load / (rests * sinks[point.body]), mass)

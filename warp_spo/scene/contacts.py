@@ -101,11 +101,16 @@ class Contact(ShapeArguments):
 
     def placements(self, ground: Any) -> list[tuple[tuple[float, float, float], Support | None]]:
         """Return position and support of the points that touch a ground, as :class:`ContactPoint` has them."""
-        middle, _, moving = self.shape.supports(isinstance(ground, HeightField))
+        middle, _, moving = self.shape.supports()
+        found: list[tuple[tuple[float, float, float], Support | None]] = []
         if not moving or isinstance(ground, Listed):
-            return [((x, y, z), None) for x, y, z in self.positions.tolist()]
-        x, y, z = middle.tolist()
-        return [((x, y, z), support) for support in moving]
+            found += [((x, y, z), None) for x, y, z in self.positions.tolist()]
+        else:
+            found += [((*middle.tolist(),), support) for support in moving]
+        if isinstance(ground, HeightField):
+            middle, grid = self.shape.grid_supports()
+            found += [((*middle.tolist(),), support) for support in grid]
+        return found
 
 
 class ContactPoint(NamedTuple):
@@ -129,6 +134,11 @@ class ContactPoint(NamedTuple):
     is_slow: bool = False
     support: Support | None = None
 
+    @property
+    def meets_grid(self) -> bool:
+        """Whether it is where its shape touches the grid of a height field, beside the shape's other points."""
+        return self.support is not None and self.support.meets_grid
+
     def place(self, normal: Any) -> np.ndarray:
         """Return where the point is, or the centre of its sphere, in the body frame [m]; ``normal`` of the ground."""
         position = np.asarray(self.position)
@@ -145,7 +155,7 @@ def contact_points(contacts: Sequence[Contact], ground: Any) -> tuple[ContactPoi
             contact.radius,
             contact.eps,
             contact.dissipation is not None,
-            contact.walls,
+            contact.walls and not (support is not None and support.meets_grid),
             contact.damping is None and contact.dissipation is None,
             support,
         )

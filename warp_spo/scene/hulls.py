@@ -45,6 +45,22 @@ class Hull(NamedTuple):
             found.append(tuple(rows.ravel().tolist()))
         return tuple(found)
 
+    @property
+    def grid_table(self) -> tuple[float, ...]:
+        """What a search of a field's grid reads: the number of faces, their planes, and then of each edge its middle
+        (3), unit direction (3), half its length, and the normals of its faces (6)."""
+        first: dict[tuple[int, int], int] = {}
+        found = [float(len(self.faces)), *self.planes]
+        for number, face in enumerate(self.faces):
+            for a, b in zip(face, [*face[1:], face[0]], strict=True):
+                first[a, b] = number
+                if (b, a) in first:
+                    start, end, other = self.corners[a], self.corners[b], self.normals[first[b, a]]
+                    length = float(np.linalg.norm(end - start))
+                    numbers = (start + end) / 2.0, (end - start) / length, [length / 2.0], self.normals[number], other
+                    found += np.concatenate(numbers).tolist()
+        return tuple(found)
+
 
 def convex_hull(call: str, points: np.ndarray, known: np.ndarray, most: int = MOST) -> tuple[Hull, np.ndarray]:
     """Return the hull of points [point, 3], and its middle [3].

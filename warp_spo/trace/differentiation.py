@@ -12,7 +12,7 @@ from .scalars import BRANCHES, Scalar, Value, cos, is_constant, logarithm, order
 
 INFINITE = ("sqrt", "reciprocal", "quotient")  # may have an infinite derivative
 UNIT_DERIVATIVE = ("add", "cut", "reduced", "guarded")  # by each argument, except the limit of "guarded"
-ZERO_DERIVATIVE = ("input", "lost", "less", "floor", "lookup")  # piecewise constant; "lost" is 0 or NaN
+ZERO_DERIVATIVE = ("input", "lost", "less", "floor", "lookup", "search")  # piecewise constant; "lost" is 0 or NaN
 
 
 def forward(outputs: Iterable[Value], inputs: Iterable[Scalar], seeds: Iterable[Value]) -> list[Value]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from .branches import Sides, branch_of, find_blocks, in_order
 from .fusion import Chain, choose_chains, choose_products
-from .scalars import BRANCHES, Scalar, Value, is_constant, is_literal, lookup, ordered
+from .scalars import BRANCHES, Scalar, Value, is_constant, is_literal, lookup, ordered, search
 
 C_TYPE = {"float32": "float", "float64": "double"}
 LIBRARY = {"exponential": "exp", "logarithm": "log", "power": "pow", "floor": "floor"}  # functions of C, also on CUDA
@@ -30,8 +30,10 @@ COST = {  # floating-point operations of a statement
     **dict.fromkeys((*BRANCHES, "less", "lost"), 1),
     "input": 0,
     "lookup": 1,
+    "search": 1,
     "floor": 1,
 }
+SEARCHED, NORMAL = 20, 3  # numbers of a search in a field or over a plane, before what a shape lists
 COST_ELSE = 8  # of the other statements: sines, roots and reciprocals take about as long as 8 additions
 
 
@@ -318,6 +320,8 @@ class Emitter:
             return self._fused_statement(scalar, self._products[scalar.key], step)
         if op == "lookup":
             return self._lookup_statements(scalar, step)
+        if op == "search":
+            return self._search_statements(scalar, step)
         texts = [self._text(a) for a in args]
         name = self._name(scalar, step)
         if op in BINARY:
@@ -351,6 +355,22 @@ class Emitter:
         names = {i: self._name(entry, step) for i, entry in enumerate(entries) if entry.key not in self._names}
         at = f"{self._names[scalar.key]}_row"
         return [f"const {T}* {at} = {place};", *(f"const {T} {name} = {at}[{i}];" for i, name in names.items())]
+
+    def _search_statements(self, scalar: Scalar, step: str) -> list[str]:
+        """Return the statements of all numbers that a search finds."""
+        (table, shape, count, _, *values), T = scalar.args, C_TYPE[self.dtype]
+        size = SEARCHED if table else NORMAL
+        found, own = search(scalar.graph, table, shape, values, count), values[size:]  # a table of the shape's own
+        asked = ", ".join(map(self._text, values[:size]))
+        names = [self._name(each, step) for each in found]
+        row, more = f"{names[0]}_row", ""
+        lines = [f"const {T} {names[0]}_asked[{size}] = {{{asked}}};", f"{T} {row}[{count}];"]
+        if own:
+            listed, more = ", ".join(literal(x, self.dtype) for x in own), f"{names[0]}_of, {len(own)}, "
+            lines.append(f"static const {T} {names[0]}_of[{len(own)}] = {{{listed}}};")
+        first = f"grid_search::{shape}({table}.data, " if table else f"hull_corners::{shape}("
+        lines.append(f"{first}{names[0]}_asked, {more}{row});")
+        return [*lines, *(f"const {T} {name} = {row}[{i}];" for i, name in enumerate(names))]
 
     def _fused_statement(self, scalar: Scalar, product: Scalar, step: str) -> list[str]:
         """Return the statement of a sum or difference that takes ``product``."""

@@ -7,7 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from ..reference import field_grid, hull_corners
 from .scalars import BRANCHES, Scalar, Value, is_constant, ordered
+
+CORNERS = 4  # numbers of a row of the table in which a search finds heights
 
 FUNCTIONS: dict[str, Callable] = {
     "add": lambda a, b: a + b,
@@ -47,6 +50,7 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
         dtype: the precision.
     """
     outputs, values = list(outputs), {}
+    searches: dict[tuple, np.ndarray] = {}
     for scalar in ordered(outputs):
         if scalar.op == "input":
             values[scalar.key] = np.asarray(load(scalar.args[0], scalar.args[1:]), dtype=dtype)
@@ -57,6 +61,14 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
             row = np.asarray(row if is_constant(row) else values[row.key], dtype=np.int64)
             numbers, entry = np.asarray(load(table, ()), dtype=dtype), width * row + column
             values[scalar.key] = numbers[(..., entry) if numbers.ndim == 1 else (np.arange(len(numbers)), entry)]
+        elif scalar.op == "search":
+            table, shape, _, column, *asked = scalar.args
+            key = (table, shape, *asked)
+            if key not in searches:
+                given = [np.asarray(x if is_constant(x) else values[x.key]) for x in asked]
+                cells = np.asarray(load(table, ())) if table else None
+                searches[key] = _search(shape, cells, np.stack(np.broadcast_arrays(*given), axis=-1))
+            values[scalar.key] = np.asarray(searches[key][..., column], dtype=dtype)
         else:
             args = []
             for a in scalar.args:
@@ -66,3 +78,20 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
                     args.append(np.asarray(a, dtype=dtype))
             values[scalar.key] = np.asarray(FUNCTIONS[scalar.op](*args), dtype=dtype)
     return [np.asarray(o, dtype=dtype) if is_constant(o) else values[o.key] for o in outputs]
+
+
+def _search(shape: str, cells: np.ndarray | None, asked: np.ndarray) -> np.ndarray:
+    """Return the numbers [..., number] that a search finds which is ``asked`` so [..., number].
+
+    ``cells``: in which it looks, [entry] or [world, entry]; None: it needs none.
+    """
+    worlds = asked.reshape(-1, asked.shape[-1])
+    found = (
+        [hull_corners.find(one).ravel() for one in worlds]
+        if cells is None
+        else [
+            field_grid.find(shape, (cells if cells.ndim == 1 else cells[at])[::CORNERS], one).ravel()
+            for at, one in enumerate(worlds)
+        ]
+    )
+    return np.reshape(found, (*asked.shape[:-1], -1))

@@ -284,6 +284,16 @@ def entry(graph: Graph, table: str, place: Value, step: int) -> Scalar:
     return graph.make("lookup", table, place, 1, step)
 
 
+def search(graph: Graph, table: str, shape: str, values: Iterable[Value], count: int) -> list[Scalar]:
+    """Return ``count`` numbers that :mod:`warp_spo.reference.field_grid` finds for a shape in a table of cells.
+
+    They are discrete, and have no derivatives. Without a ``table`` they are the corners of a hull that
+    :mod:`warp_spo.reference.hull_corners` finds.
+    """
+    values = tuple(values)
+    return [graph.make("search", table, shape, count, column, *values) for column in range(count)]
+
+
 def arctangent(y: Value, x: Value) -> Value:
     """Return the angle of the point (x, y) [rad]."""
     if is_constant(x) and is_constant(y):

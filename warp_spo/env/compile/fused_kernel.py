@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from ...kernels import native, philox, row_chunks
+from ...kernels import field_grid, hull_corners, native, philox, row_chunks
 from ...kernels.elementary import C_TYPE
 from ...kernels.elementary import NATIVE as ELEMENTARY
 from ...runtime import launches
@@ -145,7 +145,9 @@ class FusedKernel:
 
     def read_tables(self) -> set[str]:
         """Return the names of the tables that the stored values depend on."""
-        return {scalar.args[0] for scalar in ordered(item.value for item in self.stores) if scalar.op == "lookup"}
+        read = {scalar.args[0] for scalar in ordered(item.value for item in self.stores)
+                if scalar.op in ("lookup", "search")}  # fmt: skip
+        return read - {""}
 
     def _wide(self, buffers: dict[str, Buffer]) -> dict[str, list[tuple[int, int]]]:
         """Return the (first, count) of entries that a warp writes together, by array: stretches that nothing reads."""
@@ -218,7 +220,9 @@ class FusedKernel:
         if wide or any(buffers[name].passes for name in names):
             head, tail = [row_chunks.STORES, *head], [*tail, row_chunks.END_STORES]
         tail += [philox.UNDEFINE] if self.draws else []
-        text = "\n".join([ELEMENTARY[C_TYPE[wp.float32]], *head, random, *parts, *tail, ""])
+        found = "".join(parts)
+        searches = field_grid.definitions(found, wp.float32) + hull_corners.definitions(found, wp.float32)
+        text = "\n".join([ELEMENTARY[C_TYPE[wp.float32]], *searches, *head, random, *parts, *tail, ""])
         kernel = native.kernel(f"env_{self.name}", text, [(name, 1) for name in names], wp.float32)
         frames = "frame_pose" in touched or "frame_velocity" in touched
         arrays, accelerations = [buffers[name].warp() for name in names], "frame_acceleration" in touched

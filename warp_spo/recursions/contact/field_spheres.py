@@ -5,24 +5,23 @@ grid point nearest to c are tried, two along each axis, or four where the radius
 nearest point of its bilinear surface is found by Gauss and Newton from the place next to c: with slopes g and the
 height's error w there, the move u of least |e - u|^2 + (w - g . u)^2, where e leads to c, kept inside of the cell. The
 nearest cell's point is found again, with a step more, so that its derivatives are those of that cell's heights alone.
+Which cell that is a search in native code says, :mod:`kernels.field_grid`.
 
 Where a field has walls or creases a sphere may touch a second point: the nearest one that lies in another direction.
 """
 
 from __future__ import annotations
 
-import itertools
 from typing import NamedTuple
 
 from ...scene.ground import AWAY, HeightField
-from ...trace.scalars import Graph, Value, floor, inverse_root, less, reciprocal, select
+from ...trace.scalars import Graph, Value, floor, inverse_root, less, reciprocal, search, select
 from ...trace.spatial import Vector, dot
-from .ground import Corners, GroundOffset, Surface, clamp
+from .ground import GROUND, Corners, GroundOffset, Surface, clamp
 
+SPHERE, FOUND = "sphere", 5  # the search and how many numbers it finds: i, j of two cells, whether the second counts
 STEPS = 2  # of Gauss and Newton in each cell; the nearest one takes one more
 REACH = 0.71  # sine of the steepest slope, 45 degrees, whose nearest point is among the cells for sure
-APART = 0.94  # cosine of the angle beyond which a second point counts: 20 degrees
-NOWHERE = 1e12  # square of a distance [m^2] beyond all others
 TINY = 1e-20  # square of a distance [m^2] that has no direction
 
 
@@ -69,34 +68,21 @@ def sphere_surfaces(
     ``cells``: see :func:`ring`. ``second``: whether there may be two.
     """
     (size_x, size_y), (rows, columns) = ground.cells, ground.heights.shape[-2:]
-    z = centre[2] - place.origin[2] - ground.origin[2]
-    along_x = _indices(centre[0] - place.origin[0] - ground.origin[0], size_x, rows, cells)
-    along_y = _indices(centre[1] - place.origin[1] - ground.origin[1], size_y, columns, cells)
-    found = [
-        Cell(Corners.of(graph, ground, place, i, j), x, y) for (i, x), (j, y) in itertools.product(along_x, along_y)
-    ]
-    feet = [_foot(cell, z, size_x, size_y, STEPS) for cell in found]
-    nearest, _ = _least(found, [foot.square for foot in feet])
-    foot = _foot(nearest, z, size_x, size_y, STEPS + 1)
-    surface = _surface(nearest, foot, radius, 1.0 if second else None)
+    x, y, z = (at - a - b for at, a, b in zip(centre, place.origin, ground.origin, strict=True))
+    first: Value = 0.0
+    if ground.count > 1:
+        first = floor(clamp(place.field, ground.count - 1.0)) * float(rows * columns)
+    asked = [first, x, y, z, size_x, size_y, float(rows), float(columns), float(cells), float(second)]
+    *found, there = search(graph, GROUND, SPHERE, asked, FOUND)
+    at_x, at_y = clamp(x * (1.0 / size_x), rows - 1.0), clamp(y * (1.0 / size_y), columns - 1.0)
+
+    def surface(i: Value, j: Value, near: Value | None) -> Surface:
+        cell = Cell(Corners.of(graph, ground, place, i, j), (at_x - i) * size_x, (at_y - j) * size_y)
+        return _surface(cell, _foot(cell, z, size_x, size_y, STEPS + 1), radius, near)
+
     if not second:
-        return [surface]
-    squares = []
-    for other in feet:
-        turned = dot(other.away, foot.away)
-        apart = less(turned, 0.0) + less(turned * turned, (APART * APART) * (other.square * foot.square))
-        squares.append(select(apart * other.outside, other.square, NOWHERE))
-    beside, least = _least(found, squares)
-    there = foot.outside * less(least, NOWHERE)
-    return [surface, _surface(beside, _foot(beside, z, size_x, size_y, STEPS + 1), radius, there)]
-
-
-def _indices(at: Value, size: float, points: int, cells: int) -> list[tuple[Value, Value]]:
-    """Return the numbers of the cells along an axis that are tried, and where the centre is in each [m]."""
-    at = clamp(at * (1.0 / size), points - 1.0)
-    middle, last = floor(at + 0.5), points - 2.0
-    found = [clamp(middle + float(step), last) for step in range(-cells, cells)]
-    return [(cell, (at - cell) * size) for cell in found]
+        return [surface(found[0], found[1], None)]
+    return [surface(found[0], found[1], 1.0), surface(found[2], found[3], less(0.5, there))]
 
 
 def _foot(cell: Cell, z: Value, size_x: float, size_y: float, steps: int) -> Foot:
@@ -123,17 +109,6 @@ def _foot(cell: Cell, z: Value, size_x: float, size_y: float, steps: int) -> Foo
     a, b = run + twist * t, rise + twist * s
     away = Vector((x - s, y - t, above - run * s - b * t))
     return Foot(away, dot(away, away), less(0.0, away[2] - a * away[0] - b * away[1]))
-
-
-def _least(cells: list[Cell], squares: list[Value]) -> tuple[Cell, Value]:
-    """Return the cell of the least square, of equal ones the first, and that square."""
-    (corners, x, y), least = cells[0], squares[0]
-    for other, square in zip(cells[1:], squares[1:], strict=True):
-        nearer = less(square, least)
-        corners = Corners(*(select(nearer, a, b) for a, b in zip(other.corners, corners, strict=True)))
-        x, y = select(nearer, other.x, x), select(nearer, other.y, y)
-        least = select(nearer, square, least)
-    return Cell(corners, x, y), least
 
 
 def _surface(cell: Cell, foot: Foot, radius: Value, near: Value | None) -> Surface:

@@ -32,6 +32,7 @@ from ...scene.contact_values import TURNING_VALUES
 from ...scene.contacts import PUSH_OUT, ContactPoint
 from ...scene.ground import AWAY, HEIGHTS, PLACE, HeightField, Listed
 from ...scene.scene import Scene
+from ...scene.supports import CORNER, HULL_CORNER
 from ...trace.scalars import Entry, Value, absolute, branch, is_constant, less, lost, reciprocal, select
 from ...trace.spatial import IDENTITY, ZERO, Twist, Vector, cross, dot, total
 from ..kinematics import arm_on_link, carried_velocity, frame_on_link, zero
@@ -43,9 +44,10 @@ from ..model.tracing import Trace
 from ..motion import VelocityTerms, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
 from ..step.joint_laws import is_number
+from .field_grid import ROW, GridPlace, Shape, find, touch
 from .field_spheres import ring, sphere_surfaces
-from .ground import Corners, GroundOffset, Surface, directions, lowest, surface_count, surfaces, upward
-from .supports import SupportPlacement, place_support
+from .ground import Corners, GroundOffset, Surface, directions, has_walls, lowest, surface_count, surfaces, upward
+from .supports import SupportPlacement, hull_corners, place_support
 from .turning import TurningFriction, turning_names, turning_scales
 from .velocity_kicks import KICK, PATH
 
@@ -176,7 +178,8 @@ def place_points(
     asked = [*asked, *IDENTITY] if oriented and count < len(IDENTITY) else asked
     base = ContactLinkMotion(asked, [0.0] * count, still, None, still, still)
     carried = _carry_outward(trace, base, needed, qd, path, carry)
-    found = []
+    found, searches = [], dict[int, tuple[Shape, list[Value]]]()  # by contact
+    corners: dict[int, list[SupportPlacement]] = {}  # of hulls, likewise
     for number, (on, centre) in seats.items():
         point, mine = scene.contact_points[number], carried[None if on is None else id(on)]
         radius, eps, weight = point.radius, point.eps, weights[number]
@@ -188,15 +191,39 @@ def place_points(
         down = toward[lowest(ground)]
         lever = radius + total(absolute(x) for x in centre)
         hub, more = centre, None
-        if point.support is not None:
-            if isinstance(ground, HeightField):
+        grid: GridPlace | None = None
+        there: Value = 1.0
+        if point.meets_grid:
+            assert isinstance(ground, HeightField) and point.support is not None
+            if point.contact not in searches:
+                at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
+                shape = _shape_over(trace, number, ground, place_of_ground, at, toward, radius)
+                searches[point.contact] = shape, find(trace.graph, ground, place_of_ground, shape)
+            shape, rows = searches[point.contact]
+            row = rows[ROW * point.support.number : ROW * (point.support.number + 1)]
+            near = 1.0 if has_walls(ground, place_of_ground.varies) else None
+            grid = touch(trace.graph, ground, place_of_ground, shape, row, near)
+            lever = lever + point.support.reach
+            centre = centre + Vector(
+                total(x * axis[c] for x, axis in zip(grid.place, toward, strict=True)) for c in range(3)
+            )
+            hub = centre
+        elif point.support is not None:
+            if isinstance(ground, HeightField) and point.support.kind not in (CORNER, HULL_CORNER):
                 at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
                 up = upward(trace.graph, ground, at, place_of_ground)
                 down = Vector(total(n * axis[c] for n, axis in zip(up, toward, strict=True)) for c in range(3))
-            placed = _place_support(trace, number, down)
+            if point.support.kind == HULL_CORNER:
+                if point.contact not in corners:
+                    axes, _, _ = _support_values(trace, number)
+                    corners[point.contact] = hull_corners(trace.graph, point.support, axes, down)
+                placed = corners[point.contact][point.support.number]
+            else:
+                placed = _place_support(trace, number, down)
+            there = placed.there
             lever, more = lever + point.support.reach, placed.bend(mine.travel, mine.bend)
             centre, hub = centre + placed.offset, centre + placed.hub
-        arm = centre if rolls or is_number(radius, 0.0) else centre - down * radius
+        arm = centre if rolls or grid or is_number(radius, 0.0) else centre - down * radius
         place = centre if point.support is None else arm
         at = [origin + dot(axis, place) for origin, axis in zip(mine.origins, toward, strict=True)]
         if not rolls and point.support is None:
@@ -212,6 +239,8 @@ def place_points(
         moves = [ahead * dot(axis, v + cross(w, centre)) for axis in toward]
         if isinstance(ground, Listed):
             touched = [_listed_surface(joint_laws, number)]
+        elif grid is not None:
+            touched = [grid.surface]
         elif rolls and isinstance(ground, HeightField):
             second = surface_count(ground, place_of_ground.varies, point.walls, rolls) == 2
             cells = ring(ground, point.radius)
@@ -221,6 +250,7 @@ def place_points(
         for normal, depth, cell, near in touched:
             inward = Vector(total(n * axis[c] for n, axis in zip(normal, toward, strict=True)) for c in range(3))
             arm = centre - inward * radius if rolls else arm
+            depth = select(there, depth, AWAY)
             faster = h * (dot(inward, bend) if more is None else dot(inward, bend) + more)
             if half_way:  # half a step back, along a parabola
                 depth = depth + (0.5 * h) * dot(inward, v + cross(w, arm)) - (0.125 * h) * faster
@@ -297,8 +327,34 @@ def meets_field_as_sphere(ground: Any, point: ContactPoint) -> bool:
     return isinstance(ground, HeightField) and point.radius > 0.0 and point.support is None
 
 
+def _shape_over(
+    trace: Trace,
+    number: int,
+    ground: HeightField,
+    place: GroundOffset,
+    middle: list[Value],
+    toward: list[Vector],
+    radius: Value,
+) -> Shape:
+    """Return the shape of a point over a field; ``middle``: of the shape, ``toward``: the inertial axes in its link."""
+    support = trace.links.scene.contact_points[number].support
+    assert support is not None
+    axes, sizes, _ = _support_values(trace, number)
+    centre = Vector(x - place.origin[c] - ground.origin[c] for c, x in enumerate(middle))
+    turned = [Vector(dot(way, axis) for way in toward) for axis in axes]
+    return Shape(support.kind, centre, turned, sizes, radius, support.table)
+
+
 def _place_support(trace: Trace, number: int, normal: Vector) -> SupportPlacement:
     """Return where a point is that moves over its shape; ``normal`` of the ground in the axes of the point's link."""
+    support = trace.links.scene.contact_points[number].support
+    assert support is not None
+    axes, sizes, signs = _support_values(trace, number)
+    return place_support(support, axes, sizes, signs, normal)
+
+
+def _support_values(trace: Trace, number: int) -> tuple[list[Vector], list[Value], list[Value]]:
+    """Return axes of a point's shape in its link, sizes and signs of its support."""
     point, constants = trace.links.scene.contact_points[number], trace.links.shared_constants
     assert point.support is not None
     turn = trace.links.placements[point.body].matrix @ trace.links.nodes[point.body].anchor[0].T
@@ -310,7 +366,7 @@ def _place_support(trace: Trace, number: int, normal: Vector) -> SupportPlacemen
             axes = constants.of_point(number, "axes", axes)
         sizes = constants.of_point(number, "sizes", sizes)
         signs = constants.of_point(number, "signs", signs)
-    return place_support(point.support, [Vector(axes[i : i + 3]) for i in (0, 3, 6)], sizes, signs, normal)
+    return [Vector(axes[i : i + 3]) for i in (0, 3, 6)], sizes, signs
 
 
 def point_links(links: Links) -> list[Link | None]:

@@ -11,8 +11,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from ...scene.supports import CORNER, RIM, SIDES, SURFACE, UPRIGHT, Support
-from ...trace.scalars import Value, absolute, inverse_root, less, select
+from ...trace.scalars import Graph, Value, absolute, inverse_root, less, search, select
 from ...trace.spatial import Twist, Vector, cross, dot, total
+
+ROWS = 8  # corners of a hull at most
 
 
 class SupportPlacement(NamedTuple):
@@ -22,11 +24,13 @@ class SupportPlacement(NamedTuple):
         offset: of the point from the shape's middle. hub: of the material point whose path counts, likewise.
         bend: by how much more the point accelerates along the normal, for (omega; v) and (omega'; v') of the link at
             rates that stay as they are.
+        there: 1 where it counts, else 0.
     """
 
     offset: Vector
     hub: Vector
     bend: Callable[[Twist, Twist], Value]
+    there: Value = 1.0
 
 
 def place_support(
@@ -38,6 +42,14 @@ def place_support(
     """
     n = Vector(dot(axis, normal) for axis in axes)
     return PLACES[support.kind](support, axes, sizes, signs, n, normal)
+
+
+def hull_corners(graph: Graph, support: Support, axes: list[Vector], normal: Vector) -> list[SupportPlacement]:
+    """Return where all corners of a hull are that touch the ground, see :mod:`warp_spo.reference.hull_corners`."""
+    n = [dot(axis, normal) for axis in axes]
+    found = search(graph, "", "corners", [*n, *support.table], 4 * ROWS)
+    places = [_turned(axes, found[at : at + 3]) for at in range(0, len(found), 4)]
+    return [SupportPlacement(place, place, _still, there) for place, there in zip(places, found[3::4], strict=True)]
 
 
 def _turned(axes: list[Vector], local: list[Value]) -> Vector:

@@ -1,0 +1,504 @@
+"""Where shapes touch the grid of a height field, as :mod:`warp_spo.reference.field_grid` says: loops over candidates.
+
+A search reads the table of cells, four corners each, and writes four rows of nine numbers. Its loops are not unrolled,
+so that their code is short however many points of the grid lie under a shape.
+"""
+
+import functools
+import math
+
+import warp as wp
+
+from .elementary import C_TYPE
+
+NAME = "grid_search"
+RULES = {
+    "OUTWARD": 1e-3, "TIE": 1e-6, "DOWN": 0.5, "ACROSS": 0.17, "BESIDE": 0.35, "SLACK": 0.5, "PARALLEL": 1e-6,
+    "FAR": 1e30, "APART": 0.94 * 0.94, "ABOVE": 0.5, "STANDS": 0.7, "PI": math.pi,
+}  # fmt: skip
+KINDS = {"QUADRANTS": 4, "SIDE": 3, "RIM": 32, "POINT": 1, "LINE_Y": 2, "LINE_X": 3, "ROW": 9, "STEPS": 2}
+
+
+def definitions(code: str, T: type) -> list[str]:
+    """Return the definition of ``grid_search`` if the C++ text ``code`` uses it."""
+    return [native(T)] if NAME in code else []
+
+
+@functools.cache
+def native(T: type) -> str:
+    """Return the definition of ``grid_search`` for scalars of type ``T``."""
+    text, number = NATIVE.replace("REAL", C_TYPE[T]).replace("LOOP\n", "#pragma unroll 1\n"), "f" * (T is wp.float32)
+    for name, value in RULES.items():
+        text = text.replace(name, f"{value!r}{number}")
+    for name, kind in KINDS.items():
+        text = text.replace(name, str(kind))
+    return text
+
+
+NATIVE = r"""
+struct grid_search
+{
+    // What a search reads: the first height, and numbers as the reference lists them.
+    struct Field
+    {
+        const REAL* cells;
+        const REAL *centre, *axes, *sizes;
+        REAL cell[2];
+        int count[2], low[2], high[2];
+
+        CUDA_CALLABLE inline Field(const REAL* table, const REAL* asked)
+            : centre(asked + 1), axes(asked + 4), sizes(asked + 13)
+        {
+            cells = table + 4ll * (int)asked[0];
+            for (int f = 0; f < 2; ++f) {
+                cell[f] = asked[16 + f];
+                count[f] = (int)asked[18 + f];
+            }
+        }
+
+        CUDA_CALLABLE inline REAL height(int i, int j) const { return cells[4ll * (i * count[1] + j)]; }
+
+        // From a grid point along y (f = 0) or x: by how much the line rises to the next one.
+        CUDA_CALLABLE inline REAL rises(int i, int j, int f) const
+        {
+            const REAL* at = cells + 4ll * (i * count[1] + j);
+            return at[1 + f] - at[0];
+        }
+
+        CUDA_CALLABLE inline REAL limited(REAL x, int f) const
+        {
+            const REAL most = count[f] - 1;
+            x = x > 0 ? x : 0;
+            return x < most ? x : most;
+        }
+
+        // The grid points between two places, or those of the cells around them.
+        CUDA_CALLABLE inline void between(REAL from, REAL to, int f, bool around, int& first, int& last) const
+        {
+            const REAL a = limited(from / cell[f], f), b = limited(to / cell[f], f);
+            first = (int)a, last = (int)b;
+            if (!around && first < a) ++first;
+            if (around && last < b) ++last;
+        }
+
+        // Whether the shape is above the field by more than ABOVE of its size; a capsule's half length is that of its
+        // axis.
+        CUDA_CALLABLE inline bool is_far() const
+        {
+            const bool round = sizes[1] == 0;
+            const REAL half[3] = {sizes[0], round ? sizes[0] : sizes[1], sizes[2] + (round ? sizes[0] : 0)};
+            REAL reach[3];
+            int first[2], last[2];
+            for (int f = 0; f < 3; ++f) {
+                reach[f] = 0;
+                for (int k = 0; k < 3; ++k) reach[f] += on::absolute(axes[3 * k + f]) * half[k];
+                if (f < 2) between(centre[f] - reach[f], centre[f] + reach[f], f, true, first[f], last[f]);
+            }
+            const REAL lowest = centre[2] - reach[2] - ABOVE * (half[0] + half[1] + half[2]);
+            LOOP
+            for (int i = first[0]; i <= last[0]; ++i) {
+                LOOP
+                for (int j = first[1]; j <= last[1]; ++j)
+                    if (!(height(i, j) < lowest)) return false;
+            }
+            return true;
+        }
+
+        // The axis k of the shape on the direction (x, y, z).
+        CUDA_CALLABLE inline REAL along(int k, REAL x, REAL y, REAL z) const
+        {
+            return axes[3 * k] * x + axes[3 * k + 1] * y + axes[3 * k + 2] * z;
+        }
+    };
+
+    struct Best
+    {
+        REAL* rows;
+        REAL score[QUADRANTS];
+
+        CUDA_CALLABLE inline Best(REAL* out) : rows(out)
+        {
+            for (int q = 0; q < QUADRANTS; ++q) score[q] = -FAR;
+            for (int n = 0; n < QUADRANTS * ROW; ++n) rows[n] = n % ROW == 3;
+        }
+
+        // The row to write for a candidate, or none.
+        CUDA_CALLABLE inline REAL* take(REAL depth, REAL u, REAL v)
+        {
+            const int q = (u > 0 ? 1 : 0) + (v > 0 ? 2 : 0);
+            const REAL found = depth + OUTWARD * (on::absolute(u) + on::absolute(v));
+            if (!(found > score[q] + TIE)) return nullptr;
+            score[q] = found;
+            return rows + ROW * q;
+        }
+    };
+
+    static CUDA_CALLABLE inline REAL least(REAL a, REAL b) { return a < b ? a : b; }
+
+    // What looks for a polyhedron's points and edges on the grid.
+    struct Polyhedron
+    {
+        Field field;
+        Best best;
+        REAL slack;
+        int u, v;
+
+        CUDA_CALLABLE inline Polyhedron(const REAL* table, const REAL* asked, REAL* out)
+            : field(table, asked), best(out)
+        {
+            const REAL *c = field.centre, *A = field.axes, *half = field.sizes;
+            slack = SLACK * least(least(half[0], half[1]), half[2]);
+            int lowest = 0;
+            for (int k = 1; k < 3; ++k)
+                if (on::absolute(A[3 * k + 2]) > on::absolute(A[3 * lowest + 2])) lowest = k;
+            u = (lowest + 1) % 3, v = (lowest + 2) % 3;
+            for (int f = 0; f < 2; ++f) {
+                REAL reach = 0;
+                for (int k = 0; k < 3; ++k) reach += on::absolute(A[3 * k + f]) * half[k];
+                field.between(c[f] - reach, c[f] + reach, f, false, field.low[f], field.high[f]);
+            }
+        }
+
+        // The grid point (i, j) from the middle, in the axes of the shape.
+        CUDA_CALLABLE inline void from_middle(int i, int j, REAL* q) const
+        {
+            const REAL* c = field.centre;
+            const REAL x = i * field.cell[0] - c[0], y = j * field.cell[1] - c[1], z = field.height(i, j) - c[2];
+            for (int k = 0; k < 3; ++k) q[k] = field.along(k, x, y, z);
+        }
+
+        CUDA_CALLABLE inline void take_point(int i, int j, const REAL* q, REAL depth, REAL side,
+                                             const REAL* out, REAL offset)
+        {
+            if (!(side >= 0 && depth <= side + slack)) return;
+            REAL* row = best.take(depth, q[u], q[v]);
+            if (!row) return;
+            row[0] = POINT, row[1] = i, row[2] = j;
+            for (int k = 0; k < 3; ++k) row[3 + k] = out[k], row[6 + k] = offset * out[k];
+        }
+
+        // An edge about ``seat`` along ``local``, between faces with the normals ``first`` and ``second``.
+        CUDA_CALLABLE inline void cross(const REAL* seat, const REAL* local, REAL half, const REAL* first,
+                                        const REAL* second)
+        {
+            const REAL *c = field.centre, *A = field.axes;
+            REAL at[3], along[3], one[3], other[3];
+            for (int x = 0; x < 3; ++x) {
+                at[x] = c[x] + seat[0] * A[x] + seat[1] * A[3 + x] + seat[2] * A[6 + x];
+                along[x] = local[0] * A[x] + local[1] * A[3 + x] + local[2] * A[6 + x];
+                one[x] = first[0] * A[x] + first[1] * A[3 + x] + first[2] * A[6 + x];
+                other[x] = second[0] * A[x] + second[1] * A[3 + x] + second[2] * A[6 + x];
+            }
+            if (!(least(one[2], other[2]) <= -DOWN)) return;
+            LOOP
+            for (int f = 0; f < 2; ++f) {
+                const int o = 1 - f;
+                const REAL across = f == 0 ? along[0] : along[1], aside = f == 0 ? along[1] : along[0];
+                const REAL at_f = f == 0 ? at[0] : at[1], at_o = f == 0 ? at[1] : at[0];
+                if (!(on::absolute(across) >= ACROSS)) continue;
+                const REAL wide = on::absolute(across) * half;
+                int line, last;
+                field.between(at_f - wide, at_f + wide, f, false, line, last);
+                LOOP
+                for (; line <= last; ++line) {
+                    const REAL t = (line * field.cell[f] - at_f) / across;
+                    const REAL place = (at_o + t * aside) / field.cell[o];
+                    if (on::absolute(t) > half || !(place >= 0 && place <= field.count[o] - 1)) continue;
+                    const int m = (int)place < field.count[o] - 2 ? (int)place : field.count[o] - 2;
+                    const int i = f == 0 ? line : m, j = f == 0 ? m : line;
+                    const REAL rises = field.rises(i, j, f), rise = rises / field.cell[o];
+                    const REAL slope = (along[2] - aside * rise) / across;
+                    const REAL up = on::inverse_root(1 + rise * rise + slope * slope);
+                    const REAL nf = -slope * up, no = -rise * up, x = f == 0 ? nf : no, y = f == 0 ? no : nf;
+                    const REAL depth = (field.height(i, j) + (place - m) * rises - at[2] - t * along[2]) * up;
+                    const bool carries = one[0] * x + one[1] * y + one[2] * up <= BESIDE
+                        && other[0] * x + other[1] * y + other[2] * up <= BESIDE;
+                    if (!carries || on::absolute(rise) > 1 || up < DOWN
+                        || depth > half - on::absolute(t) + slack) continue;
+                    REAL* row = best.take(depth, seat[u] + t * local[u], seat[v] + t * local[v]);
+                    if (!row) continue;
+                    row[0] = f == 0 ? LINE_Y : LINE_X, row[1] = i, row[2] = j;
+                    for (int x = 0; x < 3; ++x) row[3 + x] = local[x], row[6 + x] = seat[x];
+                }
+            }
+        }
+    };
+
+    static CUDA_CALLABLE inline void box(const REAL* table, const REAL* asked, REAL* out)
+    {
+        Polyhedron shape(table, asked, out);
+        if (shape.field.is_far()) return;
+        const Field& field = shape.field;
+        const REAL *A = field.axes, *half = field.sizes;
+        LOOP
+        for (int i = field.low[0]; i <= field.high[0]; ++i) {
+            LOOP
+            for (int j = field.low[1]; j <= field.high[1]; ++j) {
+                REAL q[3], depth = FAR, side = FAR, normal[3] = {0, 0, 0}, offset = 0;
+                shape.from_middle(i, j, q);
+                int face = -1;
+                for (int k = 0; k < 3; ++k) {
+                    const REAL inside = half[k] + (A[3 * k + 2] > 0 ? q[k] : -q[k]);
+                    if (on::absolute(A[3 * k + 2]) >= DOWN && inside < depth) face = k, depth = inside;
+                }
+                if (face < 0) continue;
+                for (int k = 0; k < 3; ++k) {
+                    const REAL upper = half[k] - (A[3 * k + 2] > 0 ? q[k] : -q[k]);
+                    const bool looks = on::absolute(A[3 * k + 2]) >= DOWN;
+                    normal[k] = k != face ? 0 : A[3 * k + 2] > 0 ? -1 : 1;
+                    offset += k == face ? half[k] : 0;
+                    if (k != face) side = least(side, looks ? upper : half[k] - on::absolute(q[k]));
+                }
+                shape.take_point(i, j, q, depth, side, normal, offset);
+            }
+        }
+        LOOP
+        for (int edge = 0; edge < 12; ++edge) {
+            const int k = edge / 4, first = (k + 1) % 3, second = (k + 2) % 3;
+            const REAL a = edge & 1 ? 1 : -1, b = edge & 2 ? 1 : -1;
+            REAL seat[3], local[3], one[3], other[3];
+            for (int x = 0; x < 3; ++x) {
+                one[x] = x == first ? a : 0, other[x] = x == second ? b : 0, local[x] = x == k;
+                seat[x] = half[x] * (one[x] + other[x]);
+            }
+            shape.cross(seat, local, half[k], one, other);
+        }
+    }
+
+    // The hull's own ``count`` numbers: how many faces it has, four numbers of each, and thirteen of each edge.
+    static CUDA_CALLABLE inline void hull(const REAL* table, const REAL* asked, const REAL* of, int count, REAL* out)
+    {
+        Polyhedron shape(table, asked, out);
+        if (shape.field.is_far()) return;
+        const Field& field = shape.field;
+        const REAL* A = field.axes;
+        const int faces = (int)of[0], edges = (count - 1 - 4 * faces) / 13;
+        LOOP
+        for (int i = field.low[0]; i <= field.high[0]; ++i) {
+            LOOP
+            for (int j = field.low[1]; j <= field.high[1]; ++j) {
+                REAL q[3], depth = FAR, side = FAR;
+                shape.from_middle(i, j, q);
+                int face = -1;
+                LOOP
+                for (int n = 0; n < faces; ++n) {
+                    const REAL* each = of + 1 + 4 * n;
+                    if (!(each[0] * A[2] + each[1] * A[5] + each[2] * A[8] <= -DOWN)) continue;
+                    const REAL inside = each[3] - each[0] * q[0] - each[1] * q[1] - each[2] * q[2];
+                    if (inside < depth) face = n, depth = inside;
+                }
+                if (face < 0) continue;
+                const REAL* normal = of + 1 + 4 * face;
+                LOOP
+                for (int n = 0; n < faces; ++n) {
+                    const REAL* each = of + 1 + 4 * n;
+                    const bool looks = each[0] * A[2] + each[1] * A[5] + each[2] * A[8] <= -DOWN;
+                    const bool against = each[0] * normal[0] + each[1] * normal[1] + each[2] * normal[2] <= -DOWN;
+                    const REAL inside = each[3] - each[0] * q[0] - each[1] * q[1] - each[2] * q[2];
+                    if (!looks && !against) side = least(side, inside);
+                }
+                shape.take_point(i, j, q, depth, side, normal, normal[3]);
+            }
+        }
+        LOOP
+        for (int edge = 0; edge < edges; ++edge) {
+            const REAL* each = of + 1 + 4 * faces + 13 * edge;
+            shape.cross(each, each + 3, each[6], each + 7, each + 10);
+        }
+    }
+
+    static CUDA_CALLABLE inline void cylinder(const REAL* table, const REAL* asked, REAL* out)
+    {
+        const REAL radius = asked[13], half = asked[15], lean = asked[12];
+        if (on::absolute(lean) < STANDS) {
+            beside_axis(table, asked, SLACK * least(radius, half), SIDE, out);
+            return;
+        }
+        Polyhedron shape(table, asked, out);
+        if (shape.field.is_far()) return;
+        const Field& field = shape.field;
+        const REAL down[3] = {0, 0, (REAL)(lean > 0 ? -1 : 1)};
+        LOOP
+        for (int i = field.low[0]; i <= field.high[0]; ++i) {
+            LOOP
+            for (int j = field.low[1]; j <= field.high[1]; ++j) {
+                REAL q[3];
+                shape.from_middle(i, j, q);
+                const REAL side = radius - on::sqrt(q[0] * q[0] + q[1] * q[1]);
+                shape.take_point(i, j, q, half - down[2] * q[2], side, down, half);
+            }
+        }
+        REAL turn[2], share[2];
+        on::sincos(PI / RIM, share[1], share[0]);
+        LOOP
+        for (int edge = 0; edge < RIM; ++edge) {
+            on::sincos(2 * PI / RIM * edge, turn[1], turn[0]);
+            const REAL out[3] = {turn[0], turn[1], 0}, local[3] = {-turn[1], turn[0], 0};
+            const REAL far = radius * share[0], seat[3] = {far * out[0], far * out[1], half * down[2]};
+            shape.cross(seat, local, radius * share[1], out, down);
+        }
+    }
+
+    static CUDA_CALLABLE inline void capsule(const REAL* table, const REAL* asked, REAL* out)
+    {
+        beside_axis(table, asked, 0, 0, out);
+    }
+
+    // ``kind`` is SIDE for a cylinder, which has faces at the ends of its axis, else 0.
+    static CUDA_CALLABLE inline void beside_axis(const REAL* table, const REAL* asked, REAL slack, int kind, REAL* out)
+    {
+        Field field(table, asked);
+        Best best(out);
+        if (field.is_far()) return;
+        const REAL *c = field.centre, *axis = field.axes + 6;
+        const REAL radius = field.sizes[0], half = field.sizes[2];
+        for (int f = 0; f < 2; ++f) {
+            const REAL reach = on::absolute(axis[f]) * half + radius;
+            field.between(c[f] - reach, c[f] + reach, f, true, field.low[f], field.high[f]);
+        }
+        LOOP
+        for (int i = field.low[0]; i <= field.high[0]; ++i) {
+            LOOP
+            for (int j = field.low[1]; j <= field.high[1]; ++j) {
+                const REAL w[3] = {c[0] - i * field.cell[0], c[1] - j * field.cell[1], c[2] - field.height(i, j)};
+                const REAL along = field.along(2, w[0], w[1], w[2]);
+                LOOP
+                for (int f = -1; f < 2; ++f) { // the grid point, its line along y, its line along x
+                    REAL t = -along, s = 0, g[3] = {0, 0, 0};
+                    if (f >= 0) {
+                        const int o = 1 - f;
+                        if ((f == 0 ? j : i) + 1 >= field.count[o]) continue;
+                        g[0] = f == 0 ? 0 : field.cell[0], g[1] = f == 0 ? field.cell[1] : 0;
+                        g[2] = field.rises(i, j, f);
+                        const REAL square = g[0] * g[0] + g[1] * g[1] + g[2] * g[2];
+                        const REAL both = field.along(2, g[0], g[1], g[2]);
+                        const REAL of_line = g[0] * w[0] + g[1] * w[1] + g[2] * w[2];
+                        const REAL spread = square - both * both;
+                        if (!(spread > PARALLEL * square)) continue;
+                        t = (both * of_line - square * along) / spread;
+                        s = (of_line + both * t) / square;
+                        if (!(s >= 0 && s <= 1)) continue;
+                    }
+                    if (!(on::absolute(t) < half)) continue;
+                    REAL away[3], squares = 0;
+                    for (int x = 0; x < 3; ++x) {
+                        away[x] = w[x] + t * axis[x] - s * g[x];
+                        squares += away[x] * away[x];
+                    }
+                    const REAL z = c[2] + t * axis[2];
+                    const bool outside = surface(field, c[0] + t * axis[0], c[1] + t * axis[1]) <= z;
+                    const REAL distance = on::sqrt(squares);
+                    const bool side = away[2] >= DOWN * distance
+                        && radius - distance <= half - on::absolute(t) + slack;
+                    if (outside && !(kind ? side : away[2] > 0)) continue;
+                    REAL* row = best.take(-distance, t, 0);
+                    if (!row) continue;
+                    row[0] = kind; // of the side, or none
+                    row[0] += f < 0 ? POINT : f == 0 ? LINE_Y : LINE_X, row[1] = i, row[2] = j;
+                    row[3] = outside ? 1 : -1;
+                }
+            }
+        }
+    }
+
+    // The nearest point of a cell to a sphere's centre: the way from there to the centre, and whether that is above.
+    struct Foot
+    {
+        REAL away[3], square;
+        bool outside;
+
+        CUDA_CALLABLE inline Foot(const REAL* h, const REAL* cell, REAL x, REAL y, REAL z, int steps)
+        {
+            const REAL per_x = 1 / cell[0], per_y = 1 / cell[1];
+            const REAL run = (h[2] - h[0]) * per_x, rise = (h[1] - h[0]) * per_y;
+            const REAL twist = (h[0] - h[2] - h[1] + h[3]) * (per_x * per_y), above = z - h[0];
+            REAL s = inside(x, cell[0]), t = inside(y, cell[1]);
+            LOOP
+            for (int step = 0; step < steps; ++step) {
+                const REAL a = run + twist * t, b = rise + twist * s, w = above - run * s - b * t;
+                const REAL right_x = (x - s) + a * w, right_y = (y - t) + b * w;
+                const REAL along_x = a * a + 1, along_y = b * b + 1, both = a * b, inverse = 1 / (along_x + b * b);
+                if (step % 2 == 0) {
+                    const REAL next = inside(s + (along_y * right_x - both * right_y) * inverse, cell[0]);
+                    t = inside(t + (right_y - both * (next - s)) / along_y, cell[1]);
+                    s = next;
+                } else {
+                    const REAL next = inside(t + (along_x * right_y - both * right_x) * inverse, cell[1]);
+                    s = inside(s + (right_x - both * (next - t)) / along_x, cell[0]);
+                    t = next;
+                }
+            }
+            const REAL a = run + twist * t, b = rise + twist * s;
+            away[0] = x - s, away[1] = y - t, away[2] = above - run * s - b * t;
+            square = along(*this);
+            outside = away[2] - a * away[0] - b * away[1] > 0;
+        }
+
+        static CUDA_CALLABLE inline REAL inside(REAL x, REAL size) { return x > 0 ? (x < size ? x : size) : 0; }
+
+        CUDA_CALLABLE inline REAL along(const Foot& other) const
+        {
+            return away[0] * other.away[0] + away[1] * other.away[1] + away[2] * other.away[2];
+        }
+    };
+
+    // Asked are the first height, the centre from there, the cell, points along x and y, how many cells to each side
+    // are tried, and whether for a second one; found are the nearest cell, the second, and whether that is there.
+    static CUDA_CALLABLE inline void sphere(const REAL* table, const REAL* asked, REAL* out)
+    {
+        const REAL *cells = table + 4ll * (int)asked[0], *size = asked + 4;
+        REAL at[2];
+        int middle[2], last[2];
+        for (int f = 0; f < 2; ++f) {
+            last[f] = (int)asked[6 + f] - 2;
+            at[f] = Foot::inside(asked[1 + f] * (1 / size[f]), asked[6 + f] - 1);
+            middle[f] = (int)(at[f] + (REAL)0.5);
+        }
+        const int ring = (int)asked[8];
+        REAL first[3] = {0, 0, 0}, square = 0;
+        out[2] = out[3] = 0;
+        LOOP
+        for (int round = 0; round < 1 + (int)asked[9]; ++round) { // the second looks away from what the first found
+            REAL least = FAR;
+            int best[2] = {0, 0};
+            LOOP
+            for (int n = 0; n < 4 * ring * ring; ++n) {
+                int each[2] = {middle[0] - ring + n / (2 * ring), middle[1] - ring + n % (2 * ring)};
+                for (int f = 0; f < 2; ++f) each[f] = each[f] > 0 ? (each[f] < last[f] ? each[f] : last[f]) : 0;
+                const REAL* corners = cells + 4ll * (each[0] * (last[1] + 2) + each[1]);
+                const Foot foot(
+                    corners, size, (at[0] - each[0]) * size[0], (at[1] - each[1]) * size[1], asked[3], STEPS);
+                if (round) {
+                    const REAL turned = foot.away[0] * first[0] + foot.away[1] * first[1] + foot.away[2] * first[2];
+                    if (!foot.outside || !(turned < 0 || turned * turned < APART * foot.square * square)) continue;
+                }
+                if (foot.square < least) least = foot.square, best[0] = each[0], best[1] = each[1];
+            }
+            out[2 * round] = best[0], out[2 * round + 1] = best[1];
+            if (round) {
+                if (!(least < FAR)) out[4] = 0;
+                continue;
+            }
+            const REAL* corners = cells + 4ll * (best[0] * (last[1] + 2) + best[1]);
+            const Foot foot(
+                corners, size, (at[0] - best[0]) * size[0], (at[1] - best[1]) * size[1], asked[3], STEPS + 1);
+            for (int x = 0; x < 3; ++x) first[x] = foot.away[x];
+            square = foot.square, out[4] = foot.outside;
+        }
+    }
+
+    // The height of the field at a place.
+    static CUDA_CALLABLE inline REAL surface(const Field& field, REAL x, REAL y)
+    {
+        REAL part[2] = {field.limited(x / field.cell[0], 0), field.limited(y / field.cell[1], 1)};
+        int at[2];
+        for (int f = 0; f < 2; ++f) {
+            at[f] = (int)part[f] < field.count[f] - 2 ? (int)part[f] : field.count[f] - 2;
+            part[f] -= at[f];
+        }
+        const REAL* h = field.cells + 4ll * (at[0] * field.count[1] + at[1]);
+        const REAL low = h[0] + part[1] * (h[1] - h[0]), high = h[2] + part[1] * (h[3] - h[2]);
+        return low + part[0] * (high - low);
+    }
+};
+"""

@@ -1,0 +1,131 @@
+"""Where shapes touch the grid of a height field: which points and lines a search finds, and where these lie.
+
+The search, :mod:`warp_spo.reference.field_grid`, is native code and finds discrete things: a grid point or a line from
+it, and a face or an edge. What follows from the pose and the heights is found here, with derivatives: on a face the
+face's normal counts, at an edge, which crosses a line, the normal of both, and at the axis of a capsule the direction
+from the nearest point of the line to it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from ...scene.ground import AWAY, HeightField
+from ...scene.supports import CAPSULE_GRID, CYLINDER_GRID, GRIDS
+from ...trace.scalars import Graph, Scalar, Value, floor, inverse_root, is_constant, less, reciprocal, search, select
+from ...trace.spatial import Vector, dot, total
+from .ground import GROUND, Corners, GroundOffset, Surface, clamp, facing
+
+QUADRANTS, ROW = 4, 9  # rows of a search, and numbers of a row
+NONE, POINT, LINE_Y, FACE = 0.5, 1.5, 2.5, 3.5  # below which a row's kind is none, a point, a line along y, a face's
+SIDE = 3.0  # added to the kinds of what the side of a cylinder touches
+
+
+class Shape(NamedTuple):
+    """A shape over a field.
+
+    Attributes:
+        kind: one of GRIDS. centre: its middle, from the field's first point. axes: one each, inertial axes.
+        sizes, table: those of its supports. radius: by which it is larger [m].
+    """
+
+    kind: str
+    centre: Vector
+    axes: list[Vector]
+    sizes: list[Value]
+    radius: Value
+    table: tuple[float, ...] = ()
+
+
+class GridPlace(NamedTuple):
+    """Where a shape touches the grid: the surface there, and the place on the shape from its middle, inertial axes."""
+
+    surface: Surface
+    place: Vector
+
+
+def find(graph: Graph, ground: HeightField, place: GroundOffset, shape: Shape) -> list[Scalar]:
+    """Return what a search finds, row after row."""
+    rows, columns = ground.heights.shape[-2:]
+    first: Value = 0.0
+    if ground.count > 1:
+        first = floor(clamp(place.field, ground.count - 1.0)) * float(rows * columns)
+    asked = [first, *shape.centre, *(x for axis in shape.axes for x in axis), *shape.sizes]
+    asked += [*ground.cells, float(rows), float(columns), *shape.table]
+    return search(graph, GROUND, GRIDS[shape.kind][0], asked, QUADRANTS * ROW)
+
+
+def touch(
+    graph: Graph, ground: HeightField, place: GroundOffset, shape: Shape, row: list[Scalar], near: Value
+) -> GridPlace:
+    """Return where the shape touches what a row of :func:`find` names; ``near`` as of a surface that is always near."""
+    kind, i, j, *found = row
+    there = less(NONE, kind)
+    beside: Value = float(shape.kind == CAPSULE_GRID)
+    if shape.kind == CYLINDER_GRID:
+        beside = less(FACE, kind)
+        kind = kind - SIDE * beside
+    (size_x, size_y), along_y, is_point = ground.cells, less(kind, LINE_Y), less(kind, POINT)
+    cell = Corners.of(graph, ground, place, i, j)
+    corner = Vector((i * size_x, j * size_y, cell.h00))
+    size = size_y if size_x == size_y else select(along_y, size_y, size_x)
+    rises = select(along_y, cell.h01, cell.h10) - cell.h00
+    given, ways = (shape, corner, size, rises, along_y, is_point, found), []
+    if not is_constant(beside) or beside:
+        ways.append(_beside_axis(*given))
+    if not is_constant(beside) or not beside:
+        ways.append(_under_face(*given))
+    normal, depth, seat = ways[0]
+    if len(ways) > 1:
+        normal, seat = (
+            Vector(select(beside, a, b) for a, b in zip(ways[0][n], ways[1][n], strict=True)) for n in (0, 2)
+        )
+        depth = select(beside, depth, ways[1][1])
+    return GridPlace(Surface(normal, select(there, depth, AWAY), cell, near), seat)
+
+
+def _under_face(
+    shape: Shape, corner: Vector, size: Value, rises: Value, along_y: Value, is_point: Value, found: list[Scalar]
+) -> tuple[Vector, Value, Vector]:
+    """Return normal, depth and place of a grid point under a face, or of a line that crosses an edge."""
+    out, seat = (_turned(shape.axes, local) for local in (found[:3], found[3:6]))
+    below = corner - shape.centre - seat  # from the face or the edge to the grid point
+    depth = -dot(out, below)
+    under = below + out * depth
+    rate = reciprocal(size)
+    rise = rises * rate
+    crossed, beside = (select(along_y, below[0], below[1]), select(along_y, below[1], below[0]))
+    across, aside = (select(along_y, out[0], out[1]), select(along_y, out[1], out[0]))
+    inverse = reciprocal(select(is_point, 1.0, across))
+    slope, t = (out[2] - aside * rise) * inverse, crossed * inverse
+    normal = facing(select(along_y, slope, rise), select(along_y, rise, slope))
+    height = below[2] + (t * aside - beside) * rise - t * out[2]
+    normal, under = (
+        Vector(select(is_point, a, b) for a, b in zip(*pair, strict=True))
+        for pair in ((-out, normal), (under, out * t))
+    )
+    depth = select(is_point, depth, height * normal[2]) + shape.radius
+    return normal, depth, seat + under - normal * shape.radius
+
+
+def _beside_axis(
+    shape: Shape, corner: Vector, size: Value, rises: Value, along_y: Value, is_point: Value, found: list[Scalar]
+) -> tuple[Vector, Value, Vector]:
+    """Return normal, depth and place of a grid point or a line beside the axis of a capsule or a cylinder."""
+    axis, w = shape.axes[2], shape.centre - corner
+    g = Vector((select(along_y, 0.0, size), select(along_y, size, 0.0), rises))
+    along, both, square, of_line = dot(axis, w), dot(axis, g), dot(g, g), dot(g, w)
+    t = (both * of_line - square * along) * reciprocal(select(is_point, 1.0, square - both * both))
+    t = select(is_point, -along, t)
+    s = select(is_point, 0.0, (of_line + both * t) * reciprocal(square))
+    away = w + axis * t - g * s
+    squares = dot(away, away)
+    known = less(0.0, squares)
+    inverse = found[0] * inverse_root(select(known, squares, 1.0))
+    normal = Vector(select(known, x * inverse, y) for x, y in zip(away, (0.0, 0.0, 1.0), strict=True))
+    radius = shape.sizes[0] if shape.kind == CAPSULE_GRID else shape.sizes[0] + shape.radius
+    return normal, radius - squares * inverse, axis * t - normal * radius
+
+
+def _turned(axes: list[Vector], local: list[Scalar]) -> Vector:
+    return Vector(total(x * axis[c] for x, axis in zip(local, axes, strict=True)) for c in range(3))
