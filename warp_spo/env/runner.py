@@ -79,7 +79,8 @@ class Runner(OnPolicyRunner):
     def __init__(self, env: Env, settings: dict[str, Any], device: str):
         super().__init__(env, settings, None, device=device)
         self.stop, self.unwritten = StopRequest(), dict[str, str]()
-        self.watchers: list[Callable[[], None]] = []  # called at the end of each iteration
+        writes = getattr(env, "write_failures", None)  # of worlds that a rollout in one graph has found
+        self.watchers: list[Callable[[], None]] = [writes] if writes else []  # called at the end of each iteration
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Learn for so many iterations, as rsl_rl does, with rollouts that may be one launch."""
@@ -98,7 +99,6 @@ class Runner(OnPolicyRunner):
         for iteration in range(first, first + num_learning_iterations):
             began = Instant(self.device)
             obs = alg.collect(self.env, obs)
-            self.env.write_failures()  # type: ignore[attr-defined]
             collected = Instant(self.device)
             losses = alg.update()
             learned = Instant(self.device)
