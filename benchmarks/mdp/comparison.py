@@ -170,7 +170,7 @@ class Comparison:
                 if noise > 0.0:
                     self.noise.setdefault(f"{group}, {name}", []).append((off / noise).ravel())
                     off = np.sign(off) * np.maximum(np.abs(off) - noise, 0.0)
-                self._near(what, off, 0.0, self.task.rounded.get(name, OBSERVED))
+                self._near(what, off, 0.0, OBSERVED)
             if at != given.shape[1]:
                 self._fault(f"{group}: size", f"{given.shape[1]} numbers, not {at}")
 

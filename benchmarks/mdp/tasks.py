@@ -21,11 +21,9 @@ class Task:
     Attributes:
         steps: of an episode. seconds: range of the time until the next command, or None. pushes: largest changes of
             velocities by pushes [dof], or None.
-        rounded: names of observations that float32 holds less well than others -> largest error.
     """
 
     name, scale = "", 1.0
-    rounded: ClassVar[dict[str, float]] = {}
     seconds: Any = None
     pushes: Any = None
     steps = 0
@@ -339,7 +337,6 @@ class G1Flat(Walking):
     """A humanoid on the plane."""
 
     name, seconds, SWING = "g1-flat", (3.0, 8.0), 0.1
-    rounded: ClassVar[dict[str, float]] = {"step phase": 2e-5}  # its angle is up to 157 rad: 1.5e-5 in float32
     FEET, TRUNK = ".*_ankle_roll_link", "torso_link"
     WISHED = ((-0.5, 1.0), (-0.4, 0.4), (-0.6, 0.6))
     STANDING: ClassVar[dict[str, float]] = {".*": 0.1}

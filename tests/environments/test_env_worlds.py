@@ -127,6 +127,15 @@ def test_the_time_in_events_is_that_of_their_world():
     assert (found[:19, 1] == 1.0).all() and found[19, 1] == pytest.approx(0.4)
 
 
+def test_phases_are_counted_in_whole_steps():
+    """Of a period of seven steps, far into an episode: exact to the rounding of a number below one."""
+    env = cart_env(2, observations={"clock": [lambda w: w.phase(7 * w.dt)]}, terminations={}, episode_length_s=1e5)
+    env.episode_length_buf = torch.tensor([0, 1_000_003])
+    for step in range(1, 9):
+        found = env.step(torch.zeros(2, 1))[0]["clock"][:, 0].numpy()
+        np.testing.assert_allclose(found, [step % 7 / 7, (1_000_003 + step) % 7 / 7], atol=1e-7, rtol=0)
+
+
 def test_exports_are_of_the_robot_that_is_not_drawn():
     """Gears that a world draws are not those of an exported policy's robot, and are there again afterwards."""
     export = pytest.importorskip("warp_spo.env.export")

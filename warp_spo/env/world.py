@@ -104,6 +104,11 @@ class World:
         """Return a time [s] in steps of the environment, a number; whole where it is so but for rounding."""
         return self._layout.whole_steps(seconds)
 
+    def phase(self, period: float) -> AbstractScalar:
+        """Return which part of a period [s] has passed, from 0 to 1; of a whole number of steps it is exact."""
+        steps, count = self.whole_steps(period), self.read("episode_length", 1)[0]
+        return (count - steps * AbstractScalar(floor((count * (1.0 / steps)).value))) * (1.0 / steps)
+
     # -- actions and commands --------------------------------------------------------------------------------------
     @property
     def action(self) -> Vector:

@@ -107,7 +107,7 @@ def step_phase(stride: float, least_command: float = 0.05) -> Any:
     """Return the term of sine and cosine of 2 pi time / ``stride`` [s], a clock of steps; zeros while it stands."""
 
     def term(w: World) -> list:
-        angle = w.time * (2.0 * np.pi / stride)
+        angle = 2.0 * np.pi * w.phase(stride)
         moves = rewards.moving(w, least_command)
         return [where(moves, np.sin(angle), 0.0), where(moves, np.cos(angle), 0.0)]
 
@@ -122,7 +122,7 @@ def in_step(bodies: Any, stride: float, stance: float = 0.6, least_command: floa
     """
 
     def term(w: World) -> Any:
-        middle = np.cos(w.time * (2.0 * np.pi / stride))
+        middle = np.cos(2.0 * np.pi * w.phase(stride))
         still = ~rewards.moving(w, least_command)
         share: Any = 0.0
         for touches, at in zip(w.feet(bodies).touches, (middle, -middle), strict=True):
