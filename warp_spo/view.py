@@ -3,8 +3,10 @@
     python -m warp_spo.view my_robot.urdf                    # prints the address of its page; Ctrl-C ends it
     python -m warp_spo.view go2                              # humanoid, ant, quadruped, cartpole; those of tasks
     python -m warp_spo.view my_robot.xml --html fall.html --seconds 3      # a fall as one page, without a server
+    python -m warp_spo.view failures/world_00005_step_000057.pt    # a world that failed, its last steps on a time line
 
-ROBOT is a URDF, MJCF or USD file, or a name. The page listens on this machine alone, unless --host names an address of
+ROBOT is a URDF, MJCF or USD file, or a name; or a file of ``Env(keep_failures=...)``, whose scene is unpickled, so only
+one that you trust. The page listens on this machine alone, unless --host names an address of
 it: whoever reaches that can steer. It needs viser: pip install warp_spo[view].
 
 In Python and in Jupyter, ``warp_spo.view(robot)`` gives the page of a scene, a model or a file.
@@ -50,6 +52,8 @@ def start(arguments: list[str] | None) -> int:
 
         load_viser()
         file = find_robot(options.robot)
+        if file.suffix == ".pt":
+            return show_failure(file, options)
         more = {} if options.floating is None else {"floating": options.floating}
         page = view(file, options.host, options.port, options.contacts or True, **more)
         if options.html is not None:
@@ -61,6 +65,21 @@ def start(arguments: list[str] | None) -> int:
     except (ValueError, OSError, ImportError, TypeError) as error:
         parser.error(" ".join(str(error).split()))
     print(f"{options.robot}: {page.page.url} (Ctrl-C ends it)", flush=True)
+    page.run()
+    return 0
+
+
+def show_failure(file: Path, options: argparse.Namespace) -> int:
+    """Print what a file says of a world that failed, and show its last steps until Ctrl-C."""
+    from .env.failure_replay import read
+    from .viewing.failure_view import FailureView
+
+    if options.html is not None:
+        raise ValueError("--html with a failure; expected a robot")
+    failure = read(file)
+    page = FailureView(failure, None, options.host, options.port)
+    print(failure.describe())
+    print(f"{file}: {page.page.url} (Ctrl-C ends it)", flush=True)
     page.run()
     return 0
 
