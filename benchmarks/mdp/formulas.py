@@ -44,6 +44,9 @@ class State:
     fresh: np.ndarray
 
 
+ENDS, NOWHERE = 2, 1e3  # rows of a capsule that are its ends; a gap [m]
+
+
 class Robot:
     """A robot file as MuJoCo's compiler reads it.
 
@@ -118,14 +121,17 @@ class Robot:
         return np.array(found)
 
     def gaps(self, q: np.ndarray) -> np.ndarray:
-        """Return the distances of contact points from the ground in states at rest [world, point] [m]."""
+        """Return the distances of contact points from the ground in states at rest [world, point] [m].
+
+        They are NOWHERE in rows in which capsules touch the grid of a field, whose gaps no term of the tasks reads.
+        """
         found = np.zeros((len(q), len(self.contacts)))
         for world, each in enumerate(q):
             self._place(each)
             seen: dict[str, int] = {}
             for column, label in enumerate(self.contacts):
                 end = seen[label] = seen.get(label, -1) + 1
-                found[world, column] = self._gap(self.model.geom(label).id, end)
+                found[world, column] = self._gap(self.model.geom(label).id, end) if end < ENDS else NOWHERE
         return found
 
     def _gap(self, geom: int, end: int) -> float:
