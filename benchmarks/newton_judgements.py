@@ -75,9 +75,11 @@ JUDGEMENTS: list[tuple[str, str, str]] = [
         "wants the deprecation warning of an option of SolverSemiImplicit",
     ),
     (
-        r"slow .*OutOfTime",
+        r"gjk_mpr_multicontact",
         OPEN,
-        "takes more than a minute on two cores that others shared, compiling kernels of many shapes: no verdict",
+        "spheres, a capsule and a cylinder lean against cubes; contacts between moving bodies of a caller's list are "
+        "left out, and the status is UNSUPPORTED, so they roll down the ramp; what lies on the ramp itself stays "
+        "within 0.3 mm once ke carries it, of 2e4 N/m under 970 kg",
     ),
 ]
 """(regular expression of the test, whose fault, why), the first that matches counts."""
