@@ -175,6 +175,8 @@ ATTRIBUTES = {
     "q": (lambda w: w.q, lambda t: t.q),
     "qd": (lambda w: w.qd, lambda t: t.qd),
     "time": (lambda w: w.time, lambda t: 0.0),
+    "steps": (lambda w: w.steps, lambda t: 0.0),
+    "phase": (lambda w: w.phase(0.7), lambda t: 0.0),
     "action": (lambda w: w.action, lambda t: np.zeros(2)),
     "last_action": (lambda w: w.last_action, lambda t: np.zeros(2)),
     "action_before": (lambda w: w.action_before, lambda t: np.zeros(2)),
@@ -199,6 +201,7 @@ ATTRIBUTES = {
     "joint_force": (lambda w: w.joint_force, lambda t: t.force),
     "ground_height": (lambda w: w.ground_height(*PLACE) + 0.0 * w.time, lambda t: t.ground),
     "frame": (frame_numbers, frame_truth),
+    "jacobian": (lambda w: w.jacobian("leg1").ravel(), lambda t: t.dense.jacobian([2])[0].ravel()),
     "imu": (
         lambda w: [*w.imu("trunk").acceleration, *w.imu("trunk").rate],
         lambda t: [*(t.turn.T @ -t.value("gravity")), *t.rates[1]],
@@ -216,7 +219,8 @@ STATED = {
     "uniform": "random", "normal": "random", "integer": "random", "keep": "changes a memory",
     "stored_memory": "as memory", "read": "an array", "kept": "of the stage", "measured": "of the stage",
     "values": "in events", "present": "in the stage that changes values", "lasting": "in events",
-    "before": "in resets", "fresh": "whether it starts",
+    "before": "in resets", "fresh": "whether it starts", "at_level": "a number of a curriculum",
+    "episode_mean": "of memories, in a curriculum",
 }  # fmt: skip
 """Attributes that are no numbers of a world, or none of an observation, and what they are."""
 

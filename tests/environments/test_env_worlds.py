@@ -129,11 +129,17 @@ def test_the_time_in_events_is_that_of_their_world():
 
 def test_phases_are_counted_in_whole_steps():
     """Of a period of seven steps, far into an episode: exact to the rounding of a number below one."""
-    env = cart_env(2, observations={"clock": [lambda w: w.phase(7 * w.dt)]}, terminations={}, episode_length_s=1e5)
+    clock = lambda w: w.phase(7 * w.dt)  # noqa: E731
+    env = cart_env(
+        2, observations={"clock": [clock]}, rewards={"clock": (1.0, clock)}, terminations={}, episode_length_s=1e5,
+        final_observations=True,
+    )  # fmt: skip
+    assert (env.reset()[0]["clock"] == 0.0).all()
     env.episode_length_buf = torch.tensor([0, 1_000_003])
     for step in range(1, 9):
-        found = env.step(torch.zeros(2, 1))[0]["clock"][:, 0].numpy()
-        np.testing.assert_allclose(found, [step % 7 / 7, (1_000_003 + step) % 7 / 7], atol=1e-7, rtol=0)
+        found, rewards, _, extras = env.step(torch.zeros(2, 1))
+        for each in (found["clock"][:, 0], rewards / env.step_dt, extras["final_observations"]["clock"][:, 0]):
+            np.testing.assert_allclose(each, [step % 7 / 7, (1_000_003 + step) % 7 / 7], atol=1e-6, rtol=0)
 
 
 def test_exports_are_of_the_robot_that_is_not_drawn():

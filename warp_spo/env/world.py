@@ -97,8 +97,13 @@ class World:
         return self._layout.default_q
 
     @functools.cached_property
+    def steps(self) -> Any:
+        """Steps since the start of the episode, in which the state is that came of them."""
+        return self.read("episode_length", 1)[0]
+
+    @functools.cached_property
     def time(self) -> Any:
-        return self.read("episode_length", 1)[0] * self.dt
+        return self.steps * self.dt
 
     def whole_steps(self, seconds: float) -> float:
         """Return a time [s] in steps of the environment, a number; whole where it is so but for rounding."""
@@ -106,8 +111,9 @@ class World:
 
     def phase(self, period: float) -> AbstractScalar:
         """Return which part of a period [s] has passed, from 0 to 1; of a whole number of steps it is exact."""
-        steps, count = self.whole_steps(period), self.read("episode_length", 1)[0]
-        return (count - steps * AbstractScalar(floor((count * (1.0 / steps)).value))) * (1.0 / steps)
+        whole = self.whole_steps(period)
+        periods = AbstractScalar(floor(as_value(self.steps * (1.0 / whole))))
+        return (self.steps - whole * periods) * (1.0 / whole)
 
     # -- actions and commands --------------------------------------------------------------------------------------
     @property

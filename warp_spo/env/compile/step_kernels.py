@@ -147,7 +147,7 @@ class Tracing:
         stage.ticks = "1u"  # before observations, whose kernels run side by side
         w = self.judge = World(self.layout, stage)
         length = w.read("episode_length", 1)[0] + 1.0
-        w.__dict__["time"] = length * self.layout.step_dt
+        w.__dict__["steps"] = length
         state = self.guard.check_state(w)
         checks = [*self.guard.read_observations(w, ""), self.guard.read(w, "actions"), *state]
         total: Any = 0.0
@@ -216,7 +216,7 @@ class Tracing:
         fresh = World(self.layout, stage)
         fresh.before, fresh.lasting = self.ended if intervals else None, True
         fresh.present = dict(later.present)
-        fresh.__dict__["time"] = 0.0
+        fresh.__dict__["steps"] = 0.0
         fresh.__dict__["q"] = vector(float(x) for x in self.layout.default_q)
         fresh.__dict__["qd"] = vector(0.0 for _ in range(w.scene.dof_count))
         for event in self.events:
@@ -229,7 +229,7 @@ class Tracing:
             if intervals:
                 left = left - 1.0
                 changed = World(self.layout, stage)
-                changed.__dict__.update(q=q.copy(), qd=qd.copy(), time=w.time)
+                changed.__dict__.update(q=q.copy(), qd=qd.copy(), steps=w.steps)
                 event.change(changed)
                 q, qd = self._merge(w, q, qd, changed, left < 0.5, f"event {number}")
                 due = done | (left < 0.5)
@@ -363,7 +363,7 @@ class Tracing:
 
         def begin(stage: FusedKernel) -> World:
             w = World(self.layout, stage)
-            w.__dict__["time"] = (w.read("episode_length", 1)[0] + 1.0) * self.layout.step_dt
+            w.__dict__["steps"] = w.read("episode_length", 1)[0] + 1.0
             return w
 
         self._observe_groups(begin(self.stages["final"]), begin, "final ")
@@ -420,7 +420,7 @@ class Tracing:
     def _store_reports(self, w: World, done: Condition, later: World) -> None:
         """Store what observations read of a step, as it is in the state in which worlds start where ``done`` holds."""
         start = World(self.layout, w._stage)
-        start.__dict__.update(q=later.q, qd=later.qd, time=0.0)
+        start.__dict__.update(q=later.q, qd=later.qd, steps=0.0)
         start.present, start.kept = later.present, dict(w.kept)
         for name, (_, size, reset) in self.layout.memory.items():
             if reset is not None:
