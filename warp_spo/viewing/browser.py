@@ -150,6 +150,23 @@ class Page:
         recorded, self._recorded = self._recorded, None
         return str(recorded.as_html())
 
+    def run(self, tick: Callable[[float], None], interval: float = 0.04) -> None:
+        """Call ``tick`` with the time since the last call [s], every ``interval`` [s], until Ctrl-C; then close."""
+        pace = Pace(interval)
+        try:
+            while True:
+                tick(pace.wait())
+        except KeyboardInterrupt:
+            pass
+        finally:
+            self.close()
+
+    def record_frames(self, tick: Callable[[float], None], seconds: float, interval: float) -> None:
+        """Record so many seconds, a frame of ``tick`` every ``interval`` [s]; after :meth:`record`."""
+        for _ in range(round(seconds / interval)):
+            tick(interval)
+            self.sleep(interval)
+
     def close(self) -> None:
         """Close the pages that look, then the server."""
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):

@@ -10,7 +10,7 @@ from ..dynamics.dynamics import Dynamics
 from ..scene.ground import Plane
 from ..status import Status
 from .appearance import Appearance, scene_appearance
-from .browser import HOST, PORT, BodyLayer, Pace, Page
+from .browser import HOST, PORT, BodyLayer, Page
 from .overlays import ORANGE, Arrows, point_places
 from .pose import extent, floats
 
@@ -86,11 +86,4 @@ class FailureView:
 
     def run(self) -> None:
         """Show frames until Ctrl-C."""
-        pace = Pace()
-        try:
-            while True:
-                self.tick(pace.wait())
-        except KeyboardInterrupt:
-            pass
-        finally:
-            self.page.close()
+        self.page.run(self.tick)

@@ -14,7 +14,7 @@ from ..dynamics.dynamics import Dynamics
 from ..errors import shown
 from ..scene.ground import HeightField, Plane
 from .appearance import Appearance, scene_appearance
-from .browser import HOST, PORT, BodyLayer, Pace, Page
+from .browser import HOST, PORT, BodyLayer, Page
 from .curves import Bars, CurveChart, table
 from .pose import extent
 
@@ -290,22 +290,13 @@ class PolicyView:
     # -- uses ----------------------------------------------------------------------------------------------------------
     def run(self) -> None:
         """Let the policy act until Ctrl-C."""
-        pace = Pace(max(self.env.step_dt, 0.02))
-        try:
-            while True:
-                self.tick(pace.wait())
-        except KeyboardInterrupt:
-            pass
-        finally:
-            self.close()
+        self.page.run(self.tick, max(self.env.step_dt, 0.02))
 
     def as_html(self, seconds: float, interval: float = 0.04) -> str:
         """Return so many seconds as one page with a time slider, a picture every ``interval`` [s]."""
         self.page.record()
         self.draw()
-        for _ in range(round(seconds / interval)):
-            self.tick(interval)
-            self.page.sleep(interval)
+        self.page.record_frames(self.tick, seconds, interval)
         return self.page.as_html()
 
     def close(self) -> None:

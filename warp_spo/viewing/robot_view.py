@@ -16,7 +16,7 @@ from ..scene.ground import Plane
 from ..scene.scene import Scene
 from ..status import Status
 from .appearance import Appearance, file_appearance, model_appearance, scene_appearance
-from .browser import HOST, PORT, WORLD, BodyLayer, Pace, Page
+from .browser import HOST, PORT, WORLD, BodyLayer, Page
 from .curves import CurveChart
 from .motion import GROUNDS, Pull, RobotMotion, make_ground
 from .overlays import ORANGE, Arrows, Overlays, point_places
@@ -288,22 +288,13 @@ class RobotView:
     # -- uses ----------------------------------------------------------------------------------------------------------
     def run(self) -> None:
         """Show frames until Ctrl-C, or until the process is ended."""
-        pace = Pace()
-        try:
-            while True:
-                self.tick(pace.wait())
-        except KeyboardInterrupt:
-            pass
-        finally:
-            self.close()
+        self.page.run(self.tick)
 
     def as_html(self, seconds: float, interval: float = 0.04) -> str:
         """Return a fall of so many seconds as one page with a time slider, a picture every ``interval`` [s]."""
         self.page.record()
         self.drop()
-        for _ in range(round(seconds / interval)):
-            self.tick(interval)
-            self.page.sleep(interval)
+        self.page.record_frames(self.tick, seconds, interval)
         return self.page.as_html()
 
     def _ipython_display_(self) -> None:
