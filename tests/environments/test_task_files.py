@@ -141,15 +141,18 @@ def test_a_task_that_is_not_there_is_named(name, words):
         task(name)
 
 
+READ = {"false": False, "7": 7, "0.5": 0.5, "bfloat16": "bfloat16"}
+
+
 def test_settings_reach_every_field_of_the_learner():
     """Each takes a value of its own kind, in the words of a command line."""
     learner = learning.Learner()
     for field in dataclasses.fields(learner):
         held = getattr(learner, field.name)
-        text = {bool: "false", int: "7", float: "0.5", tuple: "[32, 16]"}[type(held)]
+        text = {bool: "false", int: "7", float: "0.5", tuple: "[32, 16]", str: "bfloat16"}[type(held)]
         own, _ = settings.split(settings.parse([f"learner.{field.name}={text}"]))
         found = getattr(settings.changed(learner, own, "learner"), field.name)
-        assert type(found) is type(held) and found == {"false": False, "7": 7, "0.5": 0.5}.get(text, (32, 16))
+        assert type(found) is type(held) and found == READ.get(text, (32, 16))
 
 
 def arguments_of(held, path=""):

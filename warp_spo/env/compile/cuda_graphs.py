@@ -10,9 +10,14 @@ from typing import Any, NamedTuple
 import torch
 
 
+def is_capturing() -> bool:
+    """Return whether torch captures a graph on its current stream."""
+    return torch.backends.cuda.is_built() and torch.cuda.is_current_stream_capturing()
+
+
 def run_all(works: Sequence[Callable[[], None]], device: torch.device | None = None) -> None:
     """Do works; a graph of a ``device`` that is being captured holds them side by side, for None in turn."""
-    if len(works) > 1 and device and device.type == "cuda" and torch.cuda.is_current_stream_capturing():
+    if len(works) > 1 and device and device.type == "cuda" and is_capturing():
         main, sides = torch.cuda.current_stream(device), [torch.cuda.Stream(device) for _ in works[1:]]
         for side in sides:
             side.wait_stream(main)
@@ -53,7 +58,7 @@ class Captured:
         """Run, or replay, on torch's current stream; inside of another capture: become part of it."""
         if self._graph is not None:
             self._graph.replay()
-        elif self._stream is None or torch.cuda.is_current_stream_capturing():
+        elif self._stream is None or is_capturing():
             self._function()
         elif self._plain == 0 and self._capture(self._stream):
             self()
@@ -122,7 +127,7 @@ class Replay:
 
     def __call__(self) -> None:
         """Run one step; inside of another capture: become part of it."""
-        if self._graphs and torch.cuda.is_current_stream_capturing():
+        if self._graphs and is_capturing():
             for part in self._parts:
                 part.run()
             return
