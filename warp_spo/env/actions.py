@@ -158,7 +158,7 @@ class ActuatorNet:
     Torques are held within the joints' ``joint_effort_limit``.
 
     Args:
-        network: an ``ActuatorNetwork`` of :mod:`warp_spo.env.actuator_nets`, the same for all its joints.
+        network: an ``ActuatorNetwork`` of ``warp_spo.env.actuator_nets``, the same for all its joints.
         joints: regular expressions of labels; None: all joints of one coordinate. They have no drives.
         scale, offset, clip: as :class:`Control`.
     """

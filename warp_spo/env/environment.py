@@ -229,7 +229,7 @@ class Env(VecEnv):
 
     @property
     def is_capturable(self) -> bool:
-        """Whether a CUDA graph can hold steps in a row: not where ``step`` is replaced; known after the first one."""
+        """Whether a CUDA graph can hold steps in a row, known after the first one; not where ``step`` is replaced."""
         return getattr(self.step, "__func__", None) is Env.step and self.replay.is_capturable
 
     @property

@@ -30,8 +30,8 @@ class DifferentialIK:
 
     Args:
         frame: name of a site or body, a body, or (body, pose in the body).
-        through: how the joints get their targets: :class:`actions.Control` for position servos, which gives the
-            hinges' coordinates as controls, or :class:`actions.Position` for drives. Its scale and offset do not count.
+        through: how the joints get their targets: ``actions.Control`` for position servos, which gives the
+            hinges' coordinates as controls, or ``actions.Position`` for drives. Its scale and offset do not count.
         kind: "position", three numbers, or "pose".
         relative: the numbers are what is missing, times ``scale``: a translation [m], and for a pose a rotation vector
             [rad]. Otherwise they are where the frame shall be, ``offset`` plus ``scale`` times the number: a position,

@@ -23,10 +23,10 @@ class FailureView:
 
     Args:
         failure: what :func:`warp_spo.env.failure_replay.read` returns. appearance: what bodies look like; None: bones
-            and contact shapes. host, port: as of :class:`Page`.
+            and contact shapes. host, port: as of ``Page``.
 
     Attributes:
-        page: the :class:`Page`. step: the slider, from the first step in the file to the one that failed.
+        page: the ``Page``. step: the slider, from the first step in the file to the one that failed.
         poses: of the bodies that are shown [body, 7].
 
     Raises:

@@ -40,13 +40,13 @@ class PolicyView:
     """The page of an environment in which a policy acts.
 
     Args:
-        env: a :class:`warp_spo.env.Env`. policy: function from observations to actions. title: of the page.
+        env: a ``warp_spo.env.Env``. policy: function from observations to actions. title: of the page.
         appearance: what bodies look like; None: bones and contact shapes of the scene.
         checkpoints: to choose from; None: the policy stays. playing: name of the checkpoint that ``policy`` is of.
-        host, port: as of :class:`Page`.
+        host, port: as of ``Page``.
 
     Attributes:
-        page: the :class:`Page`. sliders: of the commands, by name. boxes, numbers, choices: further widgets by name.
+        page: the ``Page``. sliders: of the commands, by name. boxes, numbers, choices: further widgets by name.
         paused: whether the worlds stand still. offsets: of the worlds' places in the picture [world, 3] [m].
         poses: of the bodies that are shown [world, body, 7]. ended: how often each termination has ended an episode.
     """

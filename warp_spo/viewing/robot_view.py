@@ -33,10 +33,10 @@ class RobotView:
 
     Args:
         scene: the robot. appearance: what its bodies look like. title: of the page. notes: what was left out or warned
-            of, in words. host, port: as of :class:`Page`.
+            of, in words. host, port: as of ``Page``.
 
     Attributes:
-        page: the :class:`Page`. q: coordinates that are shown [coordinate]. poses: of the bodies [body, 7].
+        page: the ``Page``. q: coordinates that are shown [coordinate]. poses: of the bodies [body, 7].
         sliders: the :class:`JointSliders`. boxes, numbers: checkboxes and numbers by name. buttons: of the motion.
         falls: whether the robot moves by itself. motion: None before it first does.
     """

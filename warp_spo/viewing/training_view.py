@@ -36,10 +36,10 @@ class TrainingView:
         scene: of the environment. copies: has ``wanted``, ``worlds`` and ``take()``, such as
             :class:`warp_spo.env.state_copies.StateCopies`. rows: returns the rows of the training so far, numbers by
             name. title: of the page. appearance: what bodies look like; None: bones and contact shapes.
-        host, port: as of :class:`Page`.
+        host, port: as of ``Page``.
 
     Attributes:
-        page: the :class:`Page`. poses: of the bodies that are shown [world, body, 7].
+        page: the ``Page``. poses: of the bodies that are shown [world, body, 7].
     """
 
     def __init__(
