@@ -26,7 +26,7 @@ from .buffers import FAULT
 from .fused_kernel import FusedKernel
 from .guard import BEYOND, LARGEST, NOT_FINITE, Check, first, within
 from .memory_layout import MemoryLayout
-from .returned import checked_event, commands_drawn, condition, controls, one_number
+from .returned import check_force, checked_event, commands_drawn, condition, controls, one_number
 from .vectors import Vector, as_value, vector
 
 CHOSEN_WORLD = "chosen.data[world]"  # C++: the world has just started anew
@@ -133,11 +133,13 @@ class Tracing:
         w.keep("action", action)
         self.guard.leave(w, "actions", checks)
         at = 0
+        forces: dict[int, Any] = {}  # what sets the force of each dof
         for part in self.actions:
             size = len(part.labels(w.scene))
             for entry, value in controls(part, w, action[at : at + size], self.layout.control_sizes):
                 if any(item.array == part.array and item.index == (entry,) for item in stage.stores):
                     raise ValueError(f"Env: two actions set entry {entry} of {part.array}; expected one")
+                check_force(part, entry, w.scene, forces)
                 stage.store(part.array, entry, as_value(value))
             at += size
 
