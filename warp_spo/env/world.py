@@ -15,7 +15,7 @@ from ..trace import spatial
 from ..trace.functions import AbstractScalar, clip, where
 from ..trace.scalars import floor, lookup
 from .compile.fused_kernel import FusedKernel
-from .compile.memory_layout import LEFT_OUT
+from .compile.memory_layout import LEFT_OUT, TAKEN
 from .compile.returned import numbers
 from .compile.vectors import Vector, as_scalar, as_value, cross, find, rotate, rotate_back, vector
 from .curricula import Curriculum, remembered_mean
@@ -105,6 +105,11 @@ class World:
     def time(self) -> Any:
         return self.steps * self.dt
 
+    @property
+    def steps_taken(self) -> Any:
+        """Steps that the world took in this episode; ``steps`` may be another number, which a caller wrote."""
+        return self.sensor(TAKEN, 1, lambda w: w.keep(TAKEN, w.memory(TAKEN, 1) + 1.0))[0]
+
     def whole_steps(self, seconds: float) -> float:
         """Return a time [s] in steps of the environment, a number; whole where it is so but for rounding."""
         return self._layout.whole_steps(seconds)
@@ -144,8 +149,10 @@ class World:
             remembered = layout.grown(name)
         return value.value(value.level.value(remembered))
 
-    def episode_mean(self, call: str, term: str) -> Any:
+    def episode_mean(self, call: str, term: str) -> tuple[Any, Any]:
         """Return the mean of a metric, or of a reward before its weight, over the steps of the episode so far.
+
+        The second value is a condition: whether there is one. A metric that was finite in no step has none.
 
         Args:
             call: that asks, in errors. term: name.

@@ -13,6 +13,7 @@ from .vectors import find
 
 ROUNDING = 1e-9  # share of a time in float64 that is its rounding
 AGE = "actuator net steps"  # name under which a world with learned actuators remembers its steps since the start
+TAKEN = "steps taken"  # name under which a world remembers how many steps its episode has had, whatever its age
 NET_TARGETS = "net_targets"  # array of the positions that learned actuators are asked for [world, coordinate]
 LEFT_OUT: Any = object()
 """In place of a value at a reset: zero, unless somebody says it."""

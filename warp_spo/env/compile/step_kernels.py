@@ -194,7 +194,7 @@ class Tracing:
         self.after = self._start(w, done, intervals=True)
 
     def _measure(self, w: World, bad: Condition) -> dict[str, Any]:
-        """Add up the metrics of a step, and return their means over the episode by name.
+        """Add up the metrics of a step, and return their means over the episode and the steps behind them by name.
 
         Steps in which a metric is not finite do not count for it.
         """
@@ -203,7 +203,11 @@ class Tracing:
             counts = within([value], LARGEST) & ~bad
             for memory, more in ((f"sum metric {name}", value), (f"steps of metric {name}", 1.0)):
                 w.keep(memory, w.memory(memory, 1) + where(counts, more, 0.0))
-        return {f"metric {name}": w.episode_mean("Env", name) for name in self.layout.metrics}
+        found = {}
+        for name in self.layout.metrics:
+            found[f"metric {name}"], _ = w.episode_mean("Env", name)
+            found[f"steps of metric {name}"] = w.kept[f"steps of metric {name}"][0]
+        return found
 
     def _start(self, w: World, done: Condition, intervals: bool) -> World:
         """Start worlds anew where ``done`` holds; let events happen and draw commands in the others.
