@@ -293,6 +293,37 @@ def test_a_written_command_is_held(asked):
 
 
 @pytest.mark.slow
+class Told:
+    """A command of one's own: the time, the action, how often it was updated in the episode, and where it was drawn."""
+
+    size, seconds = 6, (9.0, 9.0)
+
+    def draw(self, w, done):
+        return {"command": [0.0, 0.0, 0.0, w.time, w.action[0], w.q[0]]}
+
+    def update(self, w, command):
+        w.keep("updates", w.memory("updates", 1) + 1.0)
+        return [w.time, w.action[0], w.memory("updates", 1)[0], *command[3:]]
+
+
+def test_commands_of_ones_own_see_the_episode_that_starts():
+    """World 1 ends after 2 of 4 steps; time, action and memory are 0 where an episode starts, for draws, too."""
+    env = cart_env(
+        2, events=[events.joints((0.1, 0.2))], terminations={}, episode_length_s=0.08, commands=Told(),
+    )  # fmt: skip
+    env.episode_length_buf = torch.tensor([0, 2])
+    ages = [0, 2]
+    for _ in range(9):
+        observed, _, done, _ = env.step(torch.full((2, 1), 0.5))
+        for world in range(2):
+            ages[world] = 0 if done[world] else ages[world] + 1
+            time, action, updates, drawn_time, drawn_action, place = env.command[world].tolist()
+            assert time == pytest.approx(ages[world] * env.step_dt) and action == (0.5 if ages[world] else 0.0)
+            assert updates <= ages[world] + 1 and drawn_time == drawn_action == 0.0
+            if done[world]:
+                assert updates == 0.0 and place == observed["actor"][world, 0]
+
+
 def test_evaluations_hold_their_command():
     """In every observation of a rollout, the first one included; the environment's own command comes back."""
     env, seen = walker_env(4, terminations={}), []

@@ -22,7 +22,10 @@ from .curricula import Curriculum, remembered_mean
 from .feet import Feet, feet
 
 if TYPE_CHECKING:
+    from ..trace.functions import Condition
     from .compile.memory_layout import MemoryLayout
+
+ACTIONS = ("action", "action 1", "action 2")  # names under which a world remembers its actions, the newest first
 
 
 class Frame(NamedTuple):
@@ -81,6 +84,8 @@ class World:
         self.present: dict[str, np.ndarray] = {}  # values of the scene that this stage has changed
         self.lasting = False  # whether what it keeps stays when an episode starts
         self.before: World | None = None
+        self.starts: Condition | None = None  # where its episode starts, while its memory is that of the one before
+        self.forgets = False  # whether all memory that a reset clears reads as cleared there, or the actions alone
 
     # -- state -----------------------------------------------------------------------------------------------------
     @functools.cached_property
@@ -417,7 +422,11 @@ class World:
                 Left out: what another term says; None if :class:`events.Start` or :class:`events.Reset` keeps them; 0.
         """
         self._layout.remember(name, size, reset)
-        return self.kept[name] if name in self.kept else self.stored_memory(name)
+        found = self.kept[name] if name in self.kept else self.stored_memory(name)
+        cleared = self._layout.memory[name][2]
+        if self.starts is None or cleared is None or not (self.forgets or name in ACTIONS):
+            return found
+        return vector(where(self.starts, cleared, x) for x in found)
 
     def stored_memory(self, name: str) -> Vector:
         """Return numbers of :meth:`memory` as they were before this stage."""

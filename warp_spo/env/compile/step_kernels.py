@@ -246,7 +246,7 @@ class Tracing:
                 stage.store(name, i, as_value(value))
         if intervals:
             self._draw_values(w, done, later, at_reset=False)
-        later.__dict__.update(q=q, qd=qd)
+        later.__dict__.update(q=q, qd=qd, steps=where(done, 0.0, w.steps))
         if self.commands is not None:
             self._command(w, done, later, intervals)
         return later
@@ -278,14 +278,17 @@ class Tracing:
         left = w.memory("until command", 1, reset=None)[0]
         due = done | (left < 1.5) if intervals else done
         passed = 1.0 if intervals else 0.0
-        drawn = commands_drawn(self.commands, w, done if intervals else None)
+        later.starts = done
+        drawn = commands_drawn(self.commands, later, done if intervals else None)
         olds = [w.memory(name, len(values), reset=None) for name, values in drawn.items()]
         news: list[Any] = [*drawn.values(), [self._wait(w, self.commands.seconds)]]
         found = choose(due, np.concatenate(news), np.concatenate([*olds, [left - passed]]), "command")
         for name, values in zip(drawn, np.split(found, np.cumsum([*map(len, olds)])), strict=False):
             w.keep(name, values)
         w.keep("until command", found[-1:])
+        later.forgets = True
         given, updated = w.kept[COMMAND], self.commands.update(later, w.kept[COMMAND])
+        later.starts = None
         news = updated if intervals else [where(done, a, b) for a, b in zip(updated, given, strict=True)]
         held, before = w.memory(HELD, len(given), reset=None), w.stored_memory(COMMAND)
         w.keep(COMMAND, [where(mark > 0.5, old, new) for mark, old, new in zip(held, before, news, strict=True)])
