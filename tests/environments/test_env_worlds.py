@@ -357,6 +357,37 @@ def test_a_tensor_marks_what_is_written():
     assert all(type(x) is torch.Tensor for x in (held + 1.0, held.clone(), torch.stack([held]), held.double()))
 
 
+def test_functions_of_an_index_mark_what_they_write_and_refused_writes_nothing():
+    """Marks are where the same function changes a plain tensor of zeros; beside torch itself."""
+    from warp_spo.env.held_tensor import HeldTensor
+
+    mask, rows, two = torch.tensor([[True], [False], [False]]), torch.tensor([0, 2]), torch.full((2, 2), 5.0)
+    index = torch.tensor([[1], [0]])
+    for write in (
+        lambda x: x.masked_fill_(mask, 5.0), lambda x: x.masked_fill_(mask=mask, value=5.0),
+        lambda x: x.masked_scatter_(mask.expand(3, 2), two), lambda x: x.index_fill_(0, rows, 5.0),
+        lambda x: x.index_copy_(0, rows, two), lambda x: x.index_add_(0, rows, two, alpha=2.0),
+        lambda x: x.scatter_(1, index, 5.0), lambda x: x.scatter_(1, index, two, reduce="add"),
+        lambda x: x.scatter_add_(1, index=index, src=two), lambda x: x.index_put_((rows, rows // 2), two[0]),
+        lambda x: x.index_put_((rows,), two, accumulate=True), lambda x: x[1:].index_fill_(0, torch.tensor([1]), 2.0),
+        lambda x: x.__iadd__(1.0), lambda x: x.t().index_fill_(0, torch.tensor([1]), 2.0),
+    ):  # fmt: skip
+        marks, plain = torch.zeros(3, 2), torch.zeros(3, 2)
+        held = HeldTensor.of(torch.zeros(3, 2), marks)
+        write(held), write(plain)
+        assert torch.equal(marks, (plain != 0).float()) and torch.equal(
+            torch.Tensor.as_subclass(held, torch.Tensor), plain
+        )
+    for refused in (
+        lambda x: x.copy_(torch.ones(7)), lambda x: x.__setitem__(0, torch.ones(7)), lambda x: x.add_("a"),
+        lambda x: torch.add(x, torch.ones(7), out=x), lambda x: x.index_copy_(0, rows, torch.ones(3, 3)),
+    ):  # fmt: skip
+        marks = torch.zeros(3, 2)
+        with pytest.raises((RuntimeError, TypeError, IndexError)):
+            refused(HeldTensor.of(torch.zeros(3, 2), marks))
+        assert not marks.any()
+
+
 def test_joint_limits_are_the_worlds():
     scene = walker_scene(delay=0).with_values(
         joint_limit_lower=np.r_[[-1e10] * 6, [-1.4] * 7, -1e10], joint_limit_upper=np.r_[[1e10] * 6, [1.0] * 8]
