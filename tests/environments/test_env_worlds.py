@@ -201,6 +201,24 @@ def test_terms_of_one_memory_leave_it_to_each_other():
     assert landed > 5
 
 
+def test_names_of_the_environments_own_memories_are_refused():
+    """Every name of an environment's memory that its own parts keep; names that only resemble them stay free."""
+    plain = cart_env(1, metrics={"m": lambda w: 0.0}, commands=commands.Uniform(((0.0, 1.0),)),
+                     observations={"a": [observations.Observation(lambda w: w.q, history=2)]},
+                     events=[events.Interval(lambda w: None)])  # fmt: skip
+    for name in plain._layout.memory:
+        with pytest.raises(ValueError, match="under which the environment itself remembers"):
+            cart_env(1, rewards={"r": (1.0, lambda w, name=name: w.keep(name, [1.0]) or 0.0)})
+    free = ["last height", "actions", "command mine", "history", "sum", "until dawn"]
+
+    def own(w):
+        for name in free:
+            w.keep(name, [1.0])
+        return 0.0
+
+    assert {*free} < {*cart_env(1, rewards={"r": (1.0, own)})._layout.memory}
+
+
 def test_names_of_memories_tell_a_text_from_a_tuple():
     """Expressions that print alike are not the same bodies."""
     env = walker_env(

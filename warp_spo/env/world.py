@@ -15,7 +15,7 @@ from ..trace import spatial
 from ..trace.functions import AbstractScalar, clip, where
 from ..trace.scalars import floor, lookup
 from .compile.fused_kernel import FusedKernel
-from .compile.memory_layout import LEFT_OUT, TAKEN
+from .compile.memory_layout import LEFT_OUT, TAKEN, check_memory_name
 from .compile.returned import numbers
 from .compile.vectors import Vector, as_scalar, as_value, cross, find, rotate, rotate_back, vector
 from .curricula import Curriculum, remembered_mean
@@ -113,7 +113,7 @@ class World:
     @property
     def steps_taken(self) -> Any:
         """Steps that the world took in this episode; ``steps`` may be another number, which a caller wrote."""
-        return self.sensor(TAKEN, 1, lambda w: w.keep(TAKEN, w.memory(TAKEN, 1) + 1.0))[0]
+        return self.sensor(TAKEN, 1, lambda w: w.keep_own(TAKEN, w.memory(TAKEN, 1) + 1.0))[0]
 
     def whole_steps(self, seconds: float) -> float:
         """Return a time [s] in steps of the environment, a number; whole where it is so but for rounding."""
@@ -438,7 +438,15 @@ class World:
 
         What :class:`events.Start` and :class:`events.Reset` keep stays. A term that is a reward and an observation,
         too, keeps twice in a step; :meth:`sensor` does so once.
+
+        Raises:
+            ValueError: the environment itself remembers something under this name, such as "action".
         """
+        check_memory_name("World.keep", name)
+        self.keep_own(name, values)
+
+    def keep_own(self, name: str, values: Any) -> None:
+        """Set numbers of :meth:`memory` under any name, as the environment itself does."""
         size = self._layout.memory[name][1] if name in self._layout.memory else None
         self.kept[name] = numbers(f"World.keep({name!r}) was given", values, size)
         self._layout.remember(name, len(self.kept[name]), None if self.lasting else LEFT_OUT)

@@ -12,7 +12,7 @@ from ...errors import shown
 from ...trace.functions import AbstractScalar, Condition, where
 from ...trace.scalars import is_constant
 from ..validation import check_whole
-from .memory_layout import NET_TARGETS
+from .memory_layout import NET_TARGETS, check_memory_name
 from .vectors import Vector, vector
 
 if TYPE_CHECKING:
@@ -89,6 +89,8 @@ def commands_drawn(commands: Any, w: World, done: Any) -> dict[str, Vector]:
     drawn = commands.draw(w, done)
     if not isinstance(drawn, dict) or "command" not in drawn:
         raise TypeError(f"Env: commands.draw returned {came(drawn)}; expected vectors by name, 'command' among them")
+    for name in drawn.keys() - {"command"}:
+        check_memory_name("Env: commands.draw", name)
     sizes = {"command": commands.size}
     return {name: numbers(f"commands.draw returned as {name!r}", x, sizes.get(name)) for name, x in drawn.items()}
 
