@@ -84,7 +84,8 @@ class World:
         self.present: dict[str, np.ndarray] = {}  # values of the scene that this stage has changed
         self.lasting = False  # whether what it keeps stays when an episode starts
         self.before: World | None = None
-        self.starts: Condition | None = None  # where its episode starts, while its memory is that of the one before
+        # Where its episode starts while its memory is that of the one before, and the world before; None: nowhere.
+        self.starts: tuple[Condition, World] | None = None
         self.forgets = False  # whether all memory that a reset clears reads as cleared there, or the actions alone
 
     # -- state -----------------------------------------------------------------------------------------------------
@@ -104,7 +105,10 @@ class World:
     @functools.cached_property
     def steps(self) -> Any:
         """Steps since the start of the episode, in which the state is that came of them."""
-        return self.read("episode_length", 1)[0]
+        if self.starts is None:
+            return self.read("episode_length", 1)[0]
+        starts, before = self.starts
+        return where(starts, 0.0, before.steps)
 
     @functools.cached_property
     def time(self) -> Any:
@@ -426,7 +430,7 @@ class World:
         cleared = self._layout.memory[name][2]
         if self.starts is None or cleared is None or not (self.forgets or name in ACTIONS):
             return found
-        return vector(where(self.starts, cleared, x) for x in found)
+        return vector(where(self.starts[0], cleared, x) for x in found)
 
     def stored_memory(self, name: str) -> Vector:
         """Return numbers of :meth:`memory` as they were before this stage."""

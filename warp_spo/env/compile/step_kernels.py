@@ -246,7 +246,7 @@ class Tracing:
                 stage.store(name, i, as_value(value))
         if intervals:
             self._draw_values(w, done, later, at_reset=False)
-        later.__dict__.update(q=q, qd=qd, steps=where(done, 0.0, w.steps))
+        later.__dict__.update(q=q, qd=qd)
         if self.commands is not None:
             self._command(w, done, later, intervals)
         return later
@@ -278,7 +278,7 @@ class Tracing:
         left = w.memory("until command", 1, reset=None)[0]
         due = done | (left < 1.5) if intervals else done
         passed = 1.0 if intervals else 0.0
-        later.starts = done
+        later.starts = done, w
         drawn = commands_drawn(self.commands, later, done if intervals else None)
         olds = [w.memory(name, len(values), reset=None) for name, values in drawn.items()]
         news: list[Any] = [*drawn.values(), [self._wait(w, self.commands.seconds)]]
