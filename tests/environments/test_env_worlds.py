@@ -385,7 +385,7 @@ def test_functions_of_an_index_mark_what_they_write_and_refused_writes_nothing()
         lambda x: x.masked_fill_(mask, 5.0), lambda x: x.masked_fill_(mask=mask, value=5.0),
         lambda x: x.masked_scatter_(mask.expand(3, 2), two), lambda x: x.index_fill_(0, rows, 5.0),
         lambda x: x.index_copy_(0, rows, two), lambda x: x.index_add_(0, rows, two, alpha=2.0),
-        lambda x: x.scatter_(1, index, 5.0), lambda x: x.scatter_(1, index, two, reduce="add"),
+        lambda x: x.scatter_(1, index, 5.0), lambda x: x.scatter_(1, index, 5.0, reduce="add"),
         lambda x: x.scatter_add_(1, index=index, src=two), lambda x: x.index_put_((rows, rows // 2), two[0]),
         lambda x: x.index_put_((rows,), two, accumulate=True), lambda x: x[1:].index_fill_(0, torch.tensor([1]), 2.0),
         lambda x: x.__iadd__(1.0), lambda x: x.t().index_fill_(0, torch.tensor([1]), 2.0),
