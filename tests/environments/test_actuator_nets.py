@@ -175,6 +175,10 @@ def test_what_is_refused(tmp_path):
         (lambda: ActuatorNetwork.from_torchscript(saved(Doubled(), tmp_path / "d.pt")), "computes something else"),
         (lambda: walker(None, actions=actions.ActuatorNet(ActuatorNetwork(*one), "nobody")),
          "matches no joint"),
+        (lambda: walker(None, actions=[actions.Effort("joint_[12]"), actions.ActuatorNet(ActuatorNetwork(*one))]),
+         "actions.Effort and actions.ActuatorNet both set the force of joint 'joint_1'"),
+        (lambda: walker(None, actions=[actions.ActuatorNet(ActuatorNetwork(*one), "joint_2"), actions.Effort()]),
+         "actions.ActuatorNet and actions.Effort both set the force of joint 'joint_2'"),
     ):  # fmt: skip
         with pytest.raises((ValueError, TypeError), match=words):
             make()

@@ -127,6 +127,43 @@ def test_metrics_are_means_over_episodes_and_change_nothing():
     assert "Episode_Metrics/speed" not in loggers.tags(row | {"/episode/finished": 0.0, "/episode/whole": 0.0}, env, 1)
 
 
+def test_a_metric_that_was_never_finite_gives_no_verdict_and_no_mean():
+    """World 0 has a metric of -2; that of world 1 is NaN in all steps: its level stays, and the mean is -2."""
+    level = BySuccess("m", above=-0.5, below=-1.0, step=0.5)
+    env = quiet(
+        2, rewards={"one": (Curriculum(0.0, 1.0, level), lambda w: 1.0)},
+        metrics={"m": lambda w: np.log(w.command[0]) - 2.0},
+        commands=commands.Uniform(((0.5, 1.0),), seconds=(9.0, 9.0)),
+    )  # fmt: skip
+    for before in (1.0, 0.0):  # at the higher level it must not fall, at the lower one it must not rise
+        env.start_at({level.name: torch.full((2, 1), before)})
+        env.command = torch.tensor([[1.0], [-1.0]])
+        for _ in range(5):
+            env.step(zeros(env))
+        assert env.levels()[level.name][:, 0].tolist() == [max(before - 0.5, 0.0), before]
+        assert env.log()["/metric/m"] == -2.0
+
+
+def test_episodes_whose_age_was_written_count_by_the_steps_that_they_took():
+    """Ages of 3 of 5 steps: after two steps the mean of a reward of 1 is 1, not 2 of 5."""
+    level = BySuccess("a", above=0.9, step=0.5)
+    env = quiet(
+        2, rewards={"a": (2.0, lambda w: 1.0), "b": (Curriculum(0.0, 1.0, level), lambda w: 1.0)},
+        commands=commands.Velocity(level=commands.Level("a", share=0.9, first=0.25, step=0.5)),
+    )  # fmt: skip
+    env.episode_length_buf = torch.tensor([3, 0])
+    for step in range(5):
+        env.step(zeros(env))
+        expected = [0.5 * (step >= 1), 0.5 * (step >= 4)]
+        for name in (level.name, "command level"):
+            assert env.levels()[name][:, 0].tolist() == expected
+
+
+def test_levels_that_differ_in_one_digit_are_two():
+    assert BySuccess("m", above=1000000).name != BySuccess("m", above=1000001).name
+    assert BySuccess("m", above=0.5, step=1).name == "curriculum m above 0.5 by 1"
+
+
 def test_pushes_grow():
     """A free cart is pushed in each step from step 8 on: nobody moves it before, and by 2 m/s at most then."""
     import warp_spo as spo

@@ -62,6 +62,22 @@ def test_episodes_are_read_back(several, tmp_path, monkeypatch):
         datasets.record(cart_env(1), policy, "cart/none-v0", 1)
 
 
+def test_a_name_is_refused_before_an_episode_is_played(tmp_path, monkeypatch):
+    """One that Minari's own parser refuses, and one of a data set that is there."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    env = cart_env(1, final_observations=True)
+
+    def never(observed):
+        raise AssertionError("an episode was played")
+
+    for name in ("bad_name", "cart/x-v", "", None):
+        with pytest.raises(ValueError, match="which Minari refuses; expected NAME-vNUMBER"):
+            datasets.record(env, never, name, 1)
+    datasets.record(env, policy, "cart/there-v0", 1)
+    with pytest.raises(ValueError, match="has a data set 'cart/there-v0' already"):
+        datasets.record(env, never, "cart/there-v0", 1)
+
+
 def _first(read, several):
     episode = next(iter(read.iterate_episodes()))
     return {name: x[0] for name, x in episode.observations.items()} if several else episode.observations[0]

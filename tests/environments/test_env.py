@@ -350,11 +350,13 @@ def test_terrain_levels_and_height_scan():
     assert np.allclose(observed["a"][:, :18].numpy(), q[:, 2:3] - 0.5 - ground, atol=1e-4)  # steep cells, float32
     assert np.allclose(observed["a"][:, 18].numpy(), q[:, 2] - bilinear(tiles.field, q[:, 0], q[:, 1]), atol=1e-4)
     env.episode_length_buf = torch.full((8,), 99)
-    far = torch.arange(8) % 2 == 0  # half of the worlds stand more than half a tile away, the others have gone nowhere
-    env.q[:, :2] = torch.as_tensor(starts[:, :2], dtype=torch.float32) + 3.5 * far[:, None] * torch.tensor([[1.0, 0.0]])
+    far = torch.arange(8) % 2 == 0  # half of the worlds stand more than half a tile away, the others nowhere
+    some = torch.arange(8) % 4 == 1  # have gone 0.3 m in the four steps that they took, more than half of 1 m/s
+    away = torch.where(far, 3.5, torch.where(some, 0.3, 0.0))[:, None] * torch.tensor([[1.0, 0.0]])
+    env.q[:, :2] = torch.as_tensor(starts[:, :2], dtype=torch.float32) + away
     _, _, done, extras = env.step(torch.zeros(8, 8))
     assert done.all() and extras["time_outs"].all()
-    expected = torch.where(far, row + 1, (row - 1).clamp(min=0))
+    expected = torch.where(far, row + 1, torch.where(some, row, (row - 1).clamp(min=0)))
     assert env.memory("terrain")[:, 0].equal(expected) and env.memory("terrain")[:, 1].equal(column)
 
 

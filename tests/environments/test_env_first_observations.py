@@ -176,6 +176,7 @@ ATTRIBUTES = {
     "qd": (lambda w: w.qd, lambda t: t.qd),
     "time": (lambda w: w.time, lambda t: 0.0),
     "steps": (lambda w: w.steps, lambda t: 0.0),
+    "steps_taken": (lambda w: w.steps_taken, lambda t: 0.0),
     "phase": (lambda w: w.phase(0.7), lambda t: 0.0),
     "action": (lambda w: w.action, lambda t: np.zeros(2)),
     "last_action": (lambda w: w.last_action, lambda t: np.zeros(2)),
@@ -220,7 +221,8 @@ STATED = {
     "stored_memory": "as memory", "read": "an array", "kept": "of the stage", "measured": "of the stage",
     "values": "in events", "present": "in the stage that changes values", "lasting": "in events",
     "before": "in resets", "fresh": "whether it starts", "at_level": "a number of a curriculum",
-    "episode_mean": "of memories, in a curriculum",
+    "episode_mean": "of memories, in a curriculum", "keep_own": "changes a memory",
+    "starts": "in commands", "forgets": "in commands",
 }  # fmt: skip
 """Attributes that are no numbers of a world, or none of an observation, and what they are."""
 

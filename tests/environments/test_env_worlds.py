@@ -201,6 +201,24 @@ def test_terms_of_one_memory_leave_it_to_each_other():
     assert landed > 5
 
 
+def test_names_of_the_environments_own_memories_are_refused():
+    """Every name of an environment's memory that its own parts keep; names that only resemble them stay free."""
+    plain = cart_env(1, metrics={"m": lambda w: 0.0}, commands=commands.Uniform(((0.0, 1.0),)),
+                     observations={"a": [observations.Observation(lambda w: w.q, history=2)]},
+                     events=[events.Interval(lambda w: None)])  # fmt: skip
+    for name in plain._layout.memory:
+        with pytest.raises(ValueError, match="under which the environment itself remembers"):
+            cart_env(1, rewards={"r": (1.0, lambda w, name=name: w.keep(name, [1.0]) or 0.0)})
+    free = ["last height", "actions", "command mine", "history", "sum", "until dawn"]
+
+    def own(w):
+        for name in free:
+            w.keep(name, [1.0])
+        return 0.0
+
+    assert {*free} < {*cart_env(1, rewards={"r": (1.0, own)})._layout.memory}
+
+
 def test_names_of_memories_tell_a_text_from_a_tuple():
     """Expressions that print alike are not the same bodies."""
     env = walker_env(
@@ -293,6 +311,37 @@ def test_a_written_command_is_held(asked):
 
 
 @pytest.mark.slow
+class Told:
+    """A command of one's own: the time, the action, how often it was updated in the episode, and where it was drawn."""
+
+    size, seconds = 6, (9.0, 9.0)
+
+    def draw(self, w, done):
+        return {"command": [0.0, 0.0, 0.0, w.time, w.action[0], w.q[0]]}
+
+    def update(self, w, command):
+        w.keep("updates", w.memory("updates", 1) + 1.0)
+        return [w.time, w.action[0], w.memory("updates", 1)[0], *command[3:]]
+
+
+def test_commands_of_ones_own_see_the_episode_that_starts():
+    """World 1 ends after 2 of 4 steps; time, action and memory are 0 where an episode starts, for draws, too."""
+    env = cart_env(
+        2, events=[events.joints((0.1, 0.2))], terminations={}, episode_length_s=0.08, commands=Told(),
+    )  # fmt: skip
+    env.episode_length_buf = torch.tensor([0, 2])
+    ages = [0, 2]
+    for _ in range(9):
+        observed, _, done, _ = env.step(torch.full((2, 1), 0.5))
+        for world in range(2):
+            ages[world] = 0 if done[world] else ages[world] + 1
+            time, action, updates, drawn_time, drawn_action, place = env.command[world].tolist()
+            assert time == pytest.approx(ages[world] * env.step_dt) and action == (0.5 if ages[world] else 0.0)
+            assert updates <= ages[world] + 1 and drawn_time == drawn_action == 0.0
+            if done[world]:
+                assert updates == 0.0 and place == observed["actor"][world, 0]
+
+
 def test_evaluations_hold_their_command():
     """In every observation of a rollout, the first one included; the environment's own command comes back."""
     env, seen = walker_env(4, terminations={}), []
@@ -324,6 +373,37 @@ def test_a_tensor_marks_what_is_written():
         write()
         assert marks.mean(dim=1).tolist() == wanted
     assert all(type(x) is torch.Tensor for x in (held + 1.0, held.clone(), torch.stack([held]), held.double()))
+
+
+def test_functions_of_an_index_mark_what_they_write_and_refused_writes_nothing():
+    """Marks are where the same function changes a plain tensor of zeros; beside torch itself."""
+    from warp_spo.env.held_tensor import HeldTensor
+
+    mask, rows, two = torch.tensor([[True], [False], [False]]), torch.tensor([0, 2]), torch.full((2, 2), 5.0)
+    index = torch.tensor([[1], [0]])
+    for write in (
+        lambda x: x.masked_fill_(mask, 5.0), lambda x: x.masked_fill_(mask=mask, value=5.0),
+        lambda x: x.masked_scatter_(mask.expand(3, 2), two), lambda x: x.index_fill_(0, rows, 5.0),
+        lambda x: x.index_copy_(0, rows, two), lambda x: x.index_add_(0, rows, two, alpha=2.0),
+        lambda x: x.scatter_(1, index, 5.0), lambda x: x.scatter_(1, index, 5.0, reduce="add"),
+        lambda x: x.scatter_add_(1, index=index, src=two), lambda x: x.index_put_((rows, rows // 2), two[0]),
+        lambda x: x.index_put_((rows,), two, accumulate=True), lambda x: x[1:].index_fill_(0, torch.tensor([1]), 2.0),
+        lambda x: x.__iadd__(1.0), lambda x: x.t().index_fill_(0, torch.tensor([1]), 2.0),
+    ):  # fmt: skip
+        marks, plain = torch.zeros(3, 2), torch.zeros(3, 2)
+        held = HeldTensor.of(torch.zeros(3, 2), marks)
+        write(held), write(plain)
+        assert torch.equal(marks, (plain != 0).float()) and torch.equal(
+            torch.Tensor.as_subclass(held, torch.Tensor), plain
+        )
+    for refused in (
+        lambda x: x.copy_(torch.ones(7)), lambda x: x.__setitem__(0, torch.ones(7)), lambda x: x.add_("a"),
+        lambda x: torch.add(x, torch.ones(7), out=x), lambda x: x.index_copy_(0, rows, torch.ones(3, 3)),
+    ):  # fmt: skip
+        marks = torch.zeros(3, 2)
+        with pytest.raises((RuntimeError, TypeError, IndexError)):
+            refused(HeldTensor.of(torch.zeros(3, 2), marks))
+        assert not marks.any()
 
 
 def test_joint_limits_are_the_worlds():

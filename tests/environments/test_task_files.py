@@ -217,6 +217,9 @@ def test_settings_reach_every_argument_of_a_ready_task(name, monkeypatch):
         ("rewards.balance.x=3", "rewards.balance is"),
         ("dt", "--set dt: expected NAME=VALUE, such as learner.entropy=0.01"),
         ("seed=3", "seed is 3; expected it as an option"),
+        ("keep_failures=3", "Env: keep_failures is 3; expected a folder"),
+        ("metrics=x", "Env: metrics is 'x'; expected terms by name"),
+        ("bounds=3", "Env: bounds is 3; expected warp_spo.env.Bounds"),
     ],
 )
 def test_a_setting_that_is_wrong_is_one_line(given, words, tmp_path, capsys):

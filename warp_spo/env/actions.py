@@ -193,7 +193,7 @@ class ActuatorNet:
 
     def trace(self, w: World, action: Vector) -> list[tuple[int, Any]]:
         """Return (entry, value) of what the actions set."""
-        w.sensor(AGE, 1, lambda world: world.keep(AGE, world.memory(AGE, 1) + 1.0))
+        w.sensor(AGE, 1, lambda world: world.keep_own(AGE, world.memory(AGE, 1) + 1.0))
         return Position.trace(self, w, action)  # type: ignore[arg-type]
 
     labels, entries, gears = Position.labels, Position.entries, Position.gears

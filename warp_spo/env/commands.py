@@ -52,7 +52,7 @@ class Level:
         level = self.first + w.memory(LEVEL, 1, reset=None)[0]
         if done is None:
             return level
-        most = abs(w.weights[self.reward]) * w.time
+        most = abs(w.weights[self.reward]) * w.steps_taken * w.dt
         up = done & (w.memory(f"sum reward {self.reward}", 1)[0] > self.share * most)
         grown = level + where(up, self.step, 0.0)
         grown = where(grown < 1.0, grown, 1.0)

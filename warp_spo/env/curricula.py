@@ -60,8 +60,9 @@ class ByStep:
 class BySuccess:
     """A level of each world that goes from 0 to 1 as its episodes succeed.
 
-    At the end of an episode the mean of a term over its steps counts, before the weight of a reward. Episodes that end
-    for numbers that are not finite, or beyond bounds, do not count.
+    At the end of an episode the mean of a term over the steps that it took counts, before the weight of a reward.
+    Episodes that end for numbers that are not finite, or beyond bounds, do not count, nor do those in which a metric
+    was finite in no step.
 
     Args:
         term: name of a metric, or of a reward whose weight is a number.
@@ -89,8 +90,8 @@ class BySuccess:
     @property
     def name(self) -> str:
         """The name of the memory that it follows."""
-        falls = "" if self.below is None else f" below {self.below:g}"
-        return f"curriculum {self.term} above {self.above:g}{falls} by {self.step:g}"
+        falls = "" if self.below is None else f" below {_digits(self.below)}"
+        return f"curriculum {self.term} above {_digits(self.above)}{falls} by {_digits(self.step)}"
 
     def value(self, remembered: Any) -> Any:
         """Return the level for what a world remembers."""
@@ -98,7 +99,8 @@ class BySuccess:
 
     def update(self, w: World, remembered: Any, ended: Condition) -> Any:
         """Return what a world remembers after a step that may have ``ended`` an episode."""
-        mean = w.episode_mean("curricula.BySuccess", self.term)
+        mean, known = w.episode_mean("curricula.BySuccess", self.term)
+        ended = ended & known
         level = remembered + where(ended & (mean > self.above), self.step, 0.0)
         if self.below is not None:
             level = level - where(ended & (mean < self.below), self.step, 0.0)
@@ -146,8 +148,11 @@ def ends_of(value: Any) -> tuple[Any, ...]:
     return (value.first, value.last) if isinstance(value, Curriculum) else (value,)
 
 
-def remembered_mean(call: str, w: World, term: str) -> Any:
-    """Return the mean of a metric or a reward, before its weight, over the steps of the episode so far."""
+def remembered_mean(call: str, w: World, term: str) -> tuple[Any, Condition]:
+    """Return the mean of a metric or a reward, before its weight, over the steps of the episode so far.
+
+    The second value says whether there is one: a metric that was finite in no step has none.
+    """
     metric, reward = term in w._layout.metrics, term in w.weights
     if metric == reward:
         known = ", ".join(map(shown, [*w._layout.metrics, *w.weights])) or "none"
@@ -155,11 +160,19 @@ def remembered_mean(call: str, w: World, term: str) -> Any:
         raise ValueError(f"{call}: {kind} {term!r}; expected the name of one of them: {known}")
     if metric:
         total, count = w.memory(f"sum metric {term}", 1)[0], w.memory(f"steps of metric {term}", 1)[0]
-        return total / where(count > 0.5, count, 1.0)
+        return total / where(count > 0.5, count, 1.0), count > 0.5
     weight = w.weights[term]
     if isinstance(weight, Curriculum) or weight == 0.0:
         raise ValueError(
             f"{call}: the weight of reward {term!r} is {weight!r}; expected a reward with a number for its weight, not "
             "zero, or a metric"
         )
-    return w.memory(f"sum reward {term}", 1)[0] / (weight * w.time)
+    taken = w.steps_taken
+    seconds = where(taken > 0.5, taken, 1.0) * w.dt
+    return w.memory(f"sum reward {term}", 1)[0] / (weight * seconds), taken > 0.5
+
+
+def _digits(x: float) -> str:
+    """Return a number in as few digits as tell it from others."""
+    short = f"{x:g}"
+    return short if float(short) == float(x) else repr(float(x))

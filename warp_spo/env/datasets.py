@@ -34,13 +34,15 @@ def record(env: Env, policy: Policy, dataset_id: str, episodes: int, command: An
         The ``MinariDataset``, its episodes in order of each world's first ones, then the second ones.
 
     Raises:
-        ValueError: the environment has no final observations, or Minari refuses the name; a data set of this name is
-            there already.
+        ValueError: the environment has no final observations, Minari refuses the name, or a data set of this name is
+            there already; no episode is played then.
         ImportError: Minari is not installed.
     """
     try:
         import minari
         from minari.data_collector import EpisodeBuffer
+        from minari.dataset.minari_dataset import parse_dataset_id
+        from minari.storage.datasets_root_dir import get_dataset_path
     except ImportError:
         raise ImportError('datasets.record: minari is missing; pip install "minari[hdf5]"') from None
 
@@ -49,6 +51,17 @@ def record(env: Env, policy: Policy, dataset_id: str, episodes: int, command: An
         raise ValueError(
             "datasets.record: the environment has no final observations; expected Env(final_observations=True), "
             "without which the last observation of an episode is not known"
+        )
+    try:
+        parse_dataset_id(dataset_id)
+    except (ValueError, TypeError):  # TypeError: no text, or one without a version
+        raise ValueError(
+            f"datasets.record: dataset_id is {dataset_id!r}, which Minari refuses; expected NAME-vNUMBER, or "
+            "NAMESPACE/NAME-vNUMBER, such as 'go2/walk-v0'"
+        ) from None
+    if get_dataset_path(dataset_id).exists():
+        raise ValueError(
+            f"datasets.record: Minari has a data set {dataset_id!r} already; expected another name, or the next version"
         )
     quota = -(-episodes // env.num_envs)  # of each world
     found: list[list[dict[str, Any]]] = [[] for _ in range(env.num_envs)]

@@ -20,8 +20,9 @@ class Log:
 
     Means are over the worlds' last finished episodes, zero where there are none. "/episode/finished" is the number of
     worlds that have finished one, "/episode/whole" of those whose length counts: not where ``episode_length_buf`` was
-    written. "/metric/NAME" is the mean over an episode's steps. "/not finite/" and "/beyond bounds/" count what ended
-    worlds, by kind (action, state, reward, observation) and by name, such as "/not finite/reward/alive".
+    written. "/metric/NAME" is the mean over an episode's steps in which it was finite, of worlds where there was one.
+    "/not finite/" and "/beyond bounds/" count what ended worlds, by kind (action, state, reward, observation) and by
+    name, such as "/not finite/reward/alive".
 
     Args:
         layout: where the memory is. rewards, ends: names. device: of the memory. worlds: their number.
@@ -35,13 +36,14 @@ class Log:
         means |= {f"/termination/{name}": f"last end {name}" for name in ends}
         means |= {f"/metric/{name}": f"last metric {name}" for name in layout.metrics}
         means["/episode/seconds"] = "last seconds"
+        steps = [f"last steps of metric {name}" for name in layout.metrics]
         causes = [f"/{name}" for name in layout.guard.names]
         kinds = list(dict.fromkeys("/".join(name.split("/")[:3]) for name in causes))
         sums = [*kinds, *(name for name in causes if name not in kinds)]
         self._names = [*means, *sums, "/episode/finished", "/episode/whole"]
-        self._means, self._episodes = (
-            torch.tensor([layout.memory[name][0] for name in names], device=device)
-            for names in (means.values(), ["episodes"])
+        self._means, self._episodes, self._steps = (
+            torch.tensor([layout.memory[name][0] for name in names], dtype=torch.int64, device=device)
+            for names in (means.values(), ["episodes"], steps)
         )
         belongs = [
             [float(cause == name or (name in kinds and cause.startswith(f"{name}/"))) for cause in causes]
@@ -63,8 +65,11 @@ class Log:
         episodes = memory[self._episodes][0]
         finished = (episodes > 0).float()
         whole = finished * (episodes != self.cut)
-        rows = memory[self._means]  # the last one is of lengths
-        means = [*(rows[:-1] @ share(finished)).unbind(), rows[-1] @ share(whole)]
+        rows, count = memory[self._means], len(self._steps)  # the last one is of lengths, those before of metrics
+        means = [*(rows[: -1 - count] @ share(finished)).unbind()]
+        for metric, steps in zip(rows[-1 - count : -1], memory[self._steps], strict=True):
+            means.append(metric @ share(finished * (steps > 0.5)))
+        means.append(rows[-1] @ share(whole))
         found = [*means, *(self._belongs @ faults.sum(dim=1)).unbind(), finished.sum(), whole.sum()]
         return dict(zip(self._names, found, strict=True))
 

@@ -199,7 +199,7 @@ def terrain(tiles: Tiles, rows: int | None = None, level: bool = True) -> Reset:
             up = walked > 0.5 * length
             down = ~up
             if old.has_commands:
-                down = down & (walked < 0.5 * np.hypot(old.command[0], old.command[1]) * old.time)
+                down = down & (walked < 0.5 * np.hypot(old.command[0], old.command[1]) * old.steps_taken * old.dt)
             row = row + where(up, 1.0, 0.0) - where(down, 1.0, 0.0)
             row = where(row > count - 0.5, w.integer(0, count - 1), where(row < 0.0, 0.0, row))
         w.keep("terrain", [row, column])

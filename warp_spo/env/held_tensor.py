@@ -6,11 +6,21 @@ from typing import Any
 
 import torch
 
+PLACES = {
+    "masked_fill_": ("masked_fill_", ("mask",)), "masked_scatter_": ("masked_fill_", ("mask",)),
+    "index_fill_": ("index_fill_", ("dim", "index")), "index_copy_": ("index_fill_", ("dim", "index")),
+    "index_add_": ("index_fill_", ("dim", "index")), "index_reduce_": ("index_fill_", ("dim", "index")),
+    "scatter_": ("scatter_", ("dim", "index")), "scatter_add_": ("scatter_", ("dim", "index")),
+    "scatter_reduce_": ("scatter_", ("dim", "index")), "index_put_": ("index_put_", ("indices",)),
+}  # fmt: skip
+"""Function that writes in place -> the one that marks the same entries, and its arguments that say which these are."""
+
 
 class HeldTensor(torch.Tensor):
     """A tensor whose entries, when torch writes them in place, become 1 in another tensor of its shape.
 
-    Views of it mark what they write, too; all else that torch makes of it is a plain tensor.
+    Views of it mark what they write, too; all else that torch makes of it is a plain tensor. Functions in place mark
+    the entries that their mask or index names; those of ``PLACES`` have one, and all others mark the whole tensor.
     """
 
     _marks: torch.Tensor
@@ -34,13 +44,11 @@ class HeldTensor(torch.Tensor):
         kwargs = {} if kwargs is None else kwargs
         name, first = getattr(func, "__name__", ""), args[0] if args else None
         with torch._C.DisableTorchFunctionSubclass():
-            if name == "__setitem__" and isinstance(first, cls):
-                first._marks[args[1]] = 1.0
-            elif name.endswith("_") and not name.endswith("__") and isinstance(first, cls):
-                first._marks.fill_(1.0)
+            found = func(*args, **kwargs)  # before marks: what torch refuses writes nothing
+            if isinstance(first, cls):
+                _mark(first._marks, name, args[1:], kwargs)
             if isinstance(kwargs.get("out"), cls):
                 kwargs["out"]._marks.fill_(1.0)
-            found = func(*args, **kwargs)
             if found is first or not isinstance(first, cls):
                 return found
             views = found if isinstance(found, tuple | list) else [found]
@@ -50,6 +58,19 @@ class HeldTensor(torch.Tensor):
             if isinstance(found, tuple | list):
                 return type(found)(cls.of(a, b) for a, b in zip(found, marks, strict=True))
             return cls.of(found, marks)
+
+
+def _mark(marks: torch.Tensor, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+    """Mark what a tensor's function of this name has written, if any; ``args`` are those after the tensor."""
+    if name == "__setitem__":
+        marks[args[0]] = 1.0
+    elif name in PLACES:
+        function, places = PLACES[name]
+        where = [args[i] if i < len(args) else kwargs[place] for i, place in enumerate(places)]
+        one = torch.ones((), dtype=marks.dtype, device=marks.device) if name == "index_put_" else 1.0
+        getattr(marks, function)(*where, one)
+    elif name.endswith("_") and not name.endswith("__"):
+        marks.fill_(1.0)
 
 
 def _shares(tensor: torch.Tensor, other: Any) -> bool:

@@ -150,7 +150,7 @@ class Observation:
         old = w.memory(name, (count - 1) * size)
         if w.fresh is not None:
             old = vector(where(w.fresh, values[i % size], x) for i, x in enumerate(old))
-            w.keep(name, [*values, *old][: (count - 1) * size])
+            w.keep_own(name, [*values, *old][: (count - 1) * size])
         w.measured[name] = [values, *(old[i : i + size] for i in range(0, len(old), size))]
         return w.measured[name]
 

@@ -120,6 +120,8 @@ def build(chosen: Any, worlds: int, device: Any, seed: int, given: dict[str, Any
     try:
         env = chosen.build(worlds, device, seed=seed, **options)
     except Exception as error:  # whatever a user's file raises
+        if not own and isinstance(error, TypeError) and given and "; expected " in str(error):
+            raise ValueError(str(error)) from error  # the call's own words on a setting of another type
         if not own:
             raise
         text = locate(chosen, error)

@@ -15,14 +15,17 @@ from ..trace import spatial
 from ..trace.functions import AbstractScalar, clip, where
 from ..trace.scalars import floor, lookup
 from .compile.fused_kernel import FusedKernel
-from .compile.memory_layout import LEFT_OUT
+from .compile.memory_layout import LEFT_OUT, TAKEN, check_memory_name
 from .compile.returned import numbers
 from .compile.vectors import Vector, as_scalar, as_value, cross, find, rotate, rotate_back, vector
 from .curricula import Curriculum, remembered_mean
 from .feet import Feet, feet
 
 if TYPE_CHECKING:
+    from ..trace.functions import Condition
     from .compile.memory_layout import MemoryLayout
+
+ACTIONS = ("action", "action 1", "action 2")  # names under which a world remembers its actions, the newest first
 
 
 class Frame(NamedTuple):
@@ -81,6 +84,9 @@ class World:
         self.present: dict[str, np.ndarray] = {}  # values of the scene that this stage has changed
         self.lasting = False  # whether what it keeps stays when an episode starts
         self.before: World | None = None
+        # Where its episode starts while its memory is that of the one before, and the world before; None: nowhere.
+        self.starts: tuple[Condition, World] | None = None
+        self.forgets = False  # whether all memory that a reset clears reads as cleared there, or the actions alone
 
     # -- state -----------------------------------------------------------------------------------------------------
     @functools.cached_property
@@ -99,11 +105,19 @@ class World:
     @functools.cached_property
     def steps(self) -> Any:
         """Steps since the start of the episode, in which the state is that came of them."""
-        return self.read("episode_length", 1)[0]
+        if self.starts is None:
+            return self.read("episode_length", 1)[0]
+        starts, before = self.starts
+        return where(starts, 0.0, before.steps)
 
     @functools.cached_property
     def time(self) -> Any:
         return self.steps * self.dt
+
+    @property
+    def steps_taken(self) -> Any:
+        """Steps that the world took in this episode; ``steps`` may be another number, which a caller wrote."""
+        return self.sensor(TAKEN, 1, lambda w: w.keep_own(TAKEN, w.memory(TAKEN, 1) + 1.0))[0]
 
     def whole_steps(self, seconds: float) -> float:
         """Return a time [s] in steps of the environment, a number; whole where it is so but for rounding."""
@@ -144,8 +158,10 @@ class World:
             remembered = layout.grown(name)
         return value.value(value.level.value(remembered))
 
-    def episode_mean(self, call: str, term: str) -> Any:
+    def episode_mean(self, call: str, term: str) -> tuple[Any, Any]:
         """Return the mean of a metric, or of a reward before its weight, over the steps of the episode so far.
+
+        The second value is a condition: whether there is one. A metric that was finite in no step has none.
 
         Args:
             call: that asks, in errors. term: name.
@@ -410,7 +426,11 @@ class World:
                 Left out: what another term says; None if :class:`events.Start` or :class:`events.Reset` keeps them; 0.
         """
         self._layout.remember(name, size, reset)
-        return self.kept[name] if name in self.kept else self.stored_memory(name)
+        found = self.kept[name] if name in self.kept else self.stored_memory(name)
+        cleared = self._layout.memory[name][2]
+        if self.starts is None or cleared is None or not (self.forgets or name in ACTIONS):
+            return found
+        return vector(where(self.starts[0], cleared, x) for x in found)
 
     def stored_memory(self, name: str) -> Vector:
         """Return numbers of :meth:`memory` as they were before this stage."""
@@ -422,7 +442,15 @@ class World:
 
         What :class:`events.Start` and :class:`events.Reset` keep stays. A term that is a reward and an observation,
         too, keeps twice in a step; :meth:`sensor` does so once.
+
+        Raises:
+            ValueError: the environment itself remembers something under this name, such as "action".
         """
+        check_memory_name("World.keep", name)
+        self.keep_own(name, values)
+
+    def keep_own(self, name: str, values: Any) -> None:
+        """Set numbers of :meth:`memory` under any name, as the environment itself does."""
         size = self._layout.memory[name][1] if name in self._layout.memory else None
         self.kept[name] = numbers(f"World.keep({name!r}) was given", values, size)
         self._layout.remember(name, len(self.kept[name]), None if self.lasting else LEFT_OUT)

@@ -115,7 +115,7 @@ class Guard:
         for name in names:
             if w._layout.memory[name][2] is None:
                 pairs = zip(w.stored_memory(name), w.kept[name], strict=True)
-                w.keep(name, [where(bad, old, new) for old, new in pairs])
+                w.keep_own(name, [where(bad, old, new) for old, new in pairs])
 
     # -- what other stages find --------------------------------------------------------------------------------------
     def leave(self, w: World, name: str, checks: Sequence[Check], goes: Condition | None = None) -> Any:

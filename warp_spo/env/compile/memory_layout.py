@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
 
+from ...errors import shown
 from ...scene.scene import Scene
 from ..validation import check_number, check_whole
 from .guard import Guard
@@ -13,9 +15,28 @@ from .vectors import find
 
 ROUNDING = 1e-9  # share of a time in float64 that is its rounding
 AGE = "actuator net steps"  # name under which a world with learned actuators remembers its steps since the start
+TAKEN = "steps taken"  # name under which a world remembers how many steps its episode has had, whatever its age
 NET_TARGETS = "net_targets"  # array of the positions that learned actuators are asked for [world, coordinate]
 LEFT_OUT: Any = object()
 """In place of a value at a reset: zero, unless somebody says it."""
+
+
+OWN = re.compile(
+    r"action( [12])?|command( held)?|until command|until (event|values) \d+|history \d+|episodes|curriculum steps|"
+    r"last seconds|last end .*|(last |sum )reward .*|(last |sum |steps of |last steps of )metric .*|"
+    rf"{AGE}|{TAKEN}",
+    re.DOTALL,
+)
+"""Names under which an environment itself remembers something."""
+
+
+def check_memory_name(call: str, name: Any) -> None:
+    """Raise ValueError if a name of memory is one that the environment itself keeps; ``call`` is in the message."""
+    if isinstance(name, str) and OWN.fullmatch(name):
+        raise ValueError(
+            f"{call}: {shown(name)!r} is a name under which the environment itself remembers something; expected "
+            "another one"
+        )
 
 
 class MemoryLayout:
@@ -117,7 +138,7 @@ class MemoryLayout:
         """Return what a world remembers of a level after the step that "judge" looks at, which keeps it."""
         w, ended = self.judged  # type: ignore[misc]
         if name not in w.kept:
-            w.keep(name, [self.levels[name].update(w, w.memory(name, 1, reset=None)[0], ended)])
+            w.keep_own(name, [self.levels[name].update(w, w.memory(name, 1, reset=None)[0], ended)])
         return w.kept[name][0]
 
     def output(self, result: str) -> str:

@@ -12,9 +12,11 @@ from ...errors import shown
 from ...trace.functions import AbstractScalar, Condition, where
 from ...trace.scalars import is_constant
 from ..validation import check_whole
+from .memory_layout import NET_TARGETS, check_memory_name
 from .vectors import Vector, vector
 
 if TYPE_CHECKING:
+    from ...scene.scene import Scene
     from ..world import World
 
 
@@ -87,6 +89,8 @@ def commands_drawn(commands: Any, w: World, done: Any) -> dict[str, Vector]:
     drawn = commands.draw(w, done)
     if not isinstance(drawn, dict) or "command" not in drawn:
         raise TypeError(f"Env: commands.draw returned {came(drawn)}; expected vectors by name, 'command' among them")
+    for name in drawn.keys() - {"command"}:
+        check_memory_name("Env: commands.draw", name)
     sizes = {"command": commands.size}
     return {name: numbers(f"commands.draw returned as {name!r}", x, sizes.get(name)) for name, x in drawn.items()}
 
@@ -103,6 +107,26 @@ def controls(part: Any, w: World, action: Vector, sizes: dict[str, int]) -> list
     for entry, _ in found:
         check_whole(f"Env: {what}.trace", f"an entry of {part.array}", entry, 0, size - 1)
     return [(int(entry), one_number(f"{what} sets entry {entry} of {part.array} to", x)) for entry, x in found]
+
+
+def check_force(part: Any, entry: int, scene: Scene, forces: dict[int, Any]) -> None:
+    """Raise ValueError if a learned actuator, whose network sets the force of a joint, and another action both set it.
+
+    Args:
+        part: of the actions. entry: that it sets in its array. forces: what sets the force of each dof, added to.
+    """
+    if part.array not in ("tau", NET_TARGETS):
+        return
+    starts = scene.q_start if part.array == NET_TARGETS else scene.qd_start
+    hinge = int(np.searchsorted(starts, entry, side="right")) - 1
+    dof = int(scene.qd_start[hinge]) if part.array == NET_TARGETS else entry
+    other = forces.setdefault(dof, part)
+    if other.array != part.array:
+        first, second = (f"actions.{type(each).__name__}" for each in (other, part))
+        raise ValueError(
+            f"Env: {first} and {second} both set the force of joint {shown(scene.joint_labels[hinge])!r}; expected one "
+            "of them; name the joints of each with joints="
+        )
 
 
 def came(value: Any) -> str:

@@ -26,7 +26,7 @@ from .buffers import FAULT
 from .fused_kernel import FusedKernel
 from .guard import BEYOND, LARGEST, NOT_FINITE, Check, first, within
 from .memory_layout import MemoryLayout
-from .returned import checked_event, commands_drawn, condition, controls, one_number
+from .returned import check_force, checked_event, commands_drawn, condition, controls, one_number
 from .vectors import Vector, as_value, vector
 
 CHOSEN_WORLD = "chosen.data[world]"  # C++: the world has just started anew
@@ -128,16 +128,18 @@ class Tracing:
         given = w.read("actions", count)
         checks: list[Check] = []
         action = self.guard.admit("action", given, checks)
-        w.keep("action 2", w.memory("action 1", count))
-        w.keep("action 1", w.memory("action", count))
-        w.keep("action", action)
+        w.keep_own("action 2", w.memory("action 1", count))
+        w.keep_own("action 1", w.memory("action", count))
+        w.keep_own("action", action)
         self.guard.leave(w, "actions", checks)
         at = 0
+        forces: dict[int, Any] = {}  # what sets the force of each dof
         for part in self.actions:
             size = len(part.labels(w.scene))
             for entry, value in controls(part, w, action[at : at + size], self.layout.control_sizes):
                 if any(item.array == part.array and item.index == (entry,) for item in stage.stores):
                     raise ValueError(f"Env: two actions set entry {entry} of {part.array}; expected one")
+                check_force(part, entry, w.scene, forces)
                 stage.store(part.array, entry, as_value(value))
             at += size
 
@@ -163,7 +165,7 @@ class Tracing:
         if self.layout.keeps_failures:
             stage.store(FAULT, 0, as_value(fault))
         for name, value in earned.items():
-            w.keep(f"sum reward {name}", w.memory(f"sum reward {name}", 1) + where(bad, 0.0, value))
+            w.keep_own(f"sum reward {name}", w.memory(f"sum reward {name}", 1) + where(bad, 0.0, value))
         ends = {name: condition(f"termination {name!r} returned", term(w)) for name, term in self.terminations.items()}
         ends |= self.guard.ends(fault)
         self.bad, self.ended = bad, self.guard.mend(w, state)
@@ -187,12 +189,12 @@ class Tracing:
         olds = [w.memory(name, 1, reset=None)[0] for name, _ in finished]
         news = choose(done, [value for _, value in finished], olds, "end")
         for (name, _), value in zip(finished, news, strict=True):
-            w.keep(name, [value])
+            w.keep_own(name, [value])
         self.layout.judged = w, done & ~bad
         self.after = self._start(w, done, intervals=True)
 
     def _measure(self, w: World, bad: Condition) -> dict[str, Any]:
-        """Add up the metrics of a step, and return their means over the episode by name.
+        """Add up the metrics of a step, and return their means over the episode and the steps behind them by name.
 
         Steps in which a metric is not finite do not count for it.
         """
@@ -200,8 +202,12 @@ class Tracing:
             value = one_number(f"metric {name!r} returned", term(w))
             counts = within([value], LARGEST) & ~bad
             for memory, more in ((f"sum metric {name}", value), (f"steps of metric {name}", 1.0)):
-                w.keep(memory, w.memory(memory, 1) + where(counts, more, 0.0))
-        return {f"metric {name}": w.episode_mean("Env", name) for name in self.layout.metrics}
+                w.keep_own(memory, w.memory(memory, 1) + where(counts, more, 0.0))
+        found = {}
+        for name in self.layout.metrics:
+            found[f"metric {name}"], _ = w.episode_mean("Env", name)
+            found[f"steps of metric {name}"] = w.kept[f"steps of metric {name}"][0]
+        return found
 
     def _start(self, w: World, done: Condition, intervals: bool) -> World:
         """Start worlds anew where ``done`` holds; let events happen and draw commands in the others.
@@ -233,7 +239,7 @@ class Tracing:
                 event.change(changed)
                 q, qd = self._merge(w, q, qd, changed, left < 0.5, f"event {number}")
                 due = done | (left < 0.5)
-            w.keep(name, choose(due, [self._wait(w, event.seconds)], [left], name))
+            w.keep_own(name, choose(due, [self._wait(w, event.seconds)], [left], name))
         q, qd = self._merge(w, q, qd, fresh, done, "start")
         for name, values in (("q", q), ("qd", qd)):
             for i, value in enumerate(values):
@@ -265,24 +271,27 @@ class Tracing:
         sizes = [len(q), len(qd), *map(len, olds)]
         q, qd, *kept = np.split(found, np.cumsum(sizes)[:-1])
         for each, values in zip(changed.kept, kept, strict=True):
-            w.keep(each, values)
+            w.keep_own(each, values)
         return q, qd
 
     def _command(self, w: World, done: Condition, later: World, intervals: bool) -> None:
         left = w.memory("until command", 1, reset=None)[0]
         due = done | (left < 1.5) if intervals else done
         passed = 1.0 if intervals else 0.0
-        drawn = commands_drawn(self.commands, w, done if intervals else None)
+        later.starts = done, w
+        drawn = commands_drawn(self.commands, later, done if intervals else None)
         olds = [w.memory(name, len(values), reset=None) for name, values in drawn.items()]
         news: list[Any] = [*drawn.values(), [self._wait(w, self.commands.seconds)]]
         found = choose(due, np.concatenate(news), np.concatenate([*olds, [left - passed]]), "command")
         for name, values in zip(drawn, np.split(found, np.cumsum([*map(len, olds)])), strict=False):
-            w.keep(name, values)
-        w.keep("until command", found[-1:])
+            w.keep_own(name, values)
+        w.keep_own("until command", found[-1:])
+        later.forgets = True
         given, updated = w.kept[COMMAND], self.commands.update(later, w.kept[COMMAND])
+        later.starts = None
         news = updated if intervals else [where(done, a, b) for a, b in zip(updated, given, strict=True)]
         held, before = w.memory(HELD, len(given), reset=None), w.stored_memory(COMMAND)
-        w.keep(COMMAND, [where(mark > 0.5, old, new) for mark, old, new in zip(held, before, news, strict=True)])
+        w.keep_own(COMMAND, [where(mark > 0.5, old, new) for mark, old, new in zip(held, before, news, strict=True)])
 
     # -- values ----------------------------------------------------------------------------------------------------
     def _draw_values(self, w: World, done: Condition, later: World, at_reset: bool) -> None:
@@ -295,7 +304,7 @@ class Tracing:
                 left = w.memory(name, 1, reset=None)[0] - 1.0
                 due = left < 0.5
                 self._store_values(w, event, due, later)
-                w.keep(name, choose(due, [self._wait(w, event.when)], [left], name))
+                w.keep_own(name, choose(due, [self._wait(w, event.when)], [left], name))
 
     def _store_values(self, w: World, event: Values, due: Condition | None, later: World | None = None) -> None:
         """Store what an event makes of values where ``due`` holds; None: everywhere. ``later`` has what is stored."""
@@ -340,10 +349,10 @@ class Tracing:
                 event.first(w)
             w.lasting = False
         for name, draw in self.layout.drawn.items():
-            w.keep(name, draw(w))
+            w.keep_own(name, draw(w))
         for number, event in enumerate(each for each in self.events if isinstance(each, Values)):
             if not isinstance(event.when, str):
-                w.keep(f"until values {number}", [self._wait(w, event.when)])
+                w.keep_own(f"until values {number}", [self._wait(w, event.when)])
         for name, values in w.kept.items():
             self._keep(w, name, values)
 
