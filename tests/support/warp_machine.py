@@ -16,6 +16,7 @@ from warp_spo.execution.builder import Builder
 from warp_spo.execution.segment.warp_specialized import BARRIER
 from warp_spo.kernels.straight_line import BY_TABLE, IN_PLACE, TILED, KernelLayout
 from warp_spo.kernels.substeps import FENCE, SYNC
+from warp_spo.trace import evaluation
 
 NOBODY = (-1, -1)
 
@@ -146,8 +147,14 @@ def _worst(substep, status, word):
     return np.where((rank[word] > rank[before]) & ((word != 2) | (before == 0)), word, before)
 
 
+def _searched(shape, cells, asked, worlds):
+    """What a search of a field's grid finds, each number [world]."""
+    numbers = np.stack([x + 0.0 * worlds for x in asked], axis=-1)
+    return list(evaluation._search(shape, np.ravel(cells), numbers).T)
+
+
 FUNCTIONS = {
-    "worst": _worst,
+    "worst": _worst, "searched": _searched,
     "where": np.where, "nan": np.nan, "infinity": np.inf, "reciprocal": lambda x: 1.0 / x, "sqrt": np.sqrt,
     "absolute": np.abs, "reduced": lambda x: x, "within_reach": lambda x: x,
     "FUSED_float": lambda a, b, c: a * b + c, "FUSED_double": lambda a, b, c: a * b + c,
@@ -165,6 +172,9 @@ FORMS = [
     (r"^const int going = (.*);$", r"going = (\1).any()"),
     (r"^(?:const )?(?:float|double) (\w+)\[(\d+)\] = \{\};$", r"\1 = [0.0 * worlds] * \2"),
     (r"^const (?:float|double) pass_row\[1\] = \{(.*)\};$", r"pass_row = [\1 + 0.0 * worlds]"),
+    (r"^(?:static )?const (?:float|double) (\w+_(?:asked|of))\[\d+\] = \{(.*)\};$", r"\1 = [\2]"),
+    (r"^(?:float|double) (\w+_row)\[(\d+)\];$", r"\1 = [0.0 * worlds] * \2"),
+    (r"^grid_search::(\w+)\((\w+)\.data, (\w+), (\w+)\);$", r"\4 = searched('\1', \2, \3, worlds)"),
     (r"^const int (now) = (.*);$", r"\1 = \2"),
     (r"^const \w+\* (\w+) = table\.data \+ (.*);$", r"\1 = \2"),
     (
