@@ -1,4 +1,4 @@
-"""What learned actuators cost in a step of ``go2-flat``, and whether their torques are those of torch.
+"""Cost of learned actuators in a step of ``go2-flat``, and their torques beside those of torch.
 
     python -m benchmarks.actuator_nets [--worlds 4096] [--device cuda:0] [--json FILE]
 

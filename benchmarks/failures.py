@@ -1,4 +1,4 @@
-"""What it costs to keep failures of an environment, and whether their replays have the bits of the run.
+"""Cost of keeping failures of an environment, and the bits of their replays beside those of the run.
 
     python -m benchmarks.failures [--task go2-flat] [--worlds 4096] [--device cuda:0] [--json FILE]
 

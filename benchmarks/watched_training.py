@@ -1,4 +1,4 @@
-"""What does it cost a training that somebody looks? Times of an iteration without a page, with one, and looked at.
+"""Times of an iteration of a training: without a page, with a page, and while a browser looks at it.
 
     python -m benchmarks.watched_training --device cuda:0 --json watched.json
 

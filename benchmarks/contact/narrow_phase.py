@@ -154,7 +154,7 @@ def matrices(turns: np.ndarray) -> np.ndarray:
 
 
 class PairErrors(NamedTuple):
-    """What a pair of shapes does at shallow poses.
+    """Errors of a pair of shapes at shallow poses.
 
     Attributes:
         missed, ghosts: poses without a point, and poses apart with one. normals: share within ANGLE. worst: largest

@@ -148,7 +148,7 @@ def _worst(substep, status, word):
 
 
 def _searched(shape, cells, asked, worlds):
-    """What a search of a field's grid finds, each number [world]."""
+    """Return the numbers that a search of a field's grid finds, each [world]."""
     numbers = np.stack([x + 0.0 * worlds for x in asked], axis=-1)
     return list(evaluation._search(shape, np.ravel(cells), numbers).T)
 
