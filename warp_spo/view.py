@@ -55,7 +55,7 @@ def start(arguments: list[str] | None) -> int:
         if file.suffix == ".pt":
             return show_failure(file, options)
         more = {} if options.floating is None else {"floating": options.floating}
-        page = view(file, options.host, options.port, options.contacts or True, **more)
+        page = view(file, options.host, options.port, options.contacts or "ground", **more)
         if options.html is not None:
             options.html.parent.mkdir(parents=True, exist_ok=True)
             options.html.write_text(page.as_html(options.seconds))

@@ -181,7 +181,7 @@ def models() -> Iterator[Row]:
     from warp_spo.newton import shipped
 
     for name in ("ant", "humanoid"):
-        scene = spo.load(shipped(name), contacts=True)
+        scene = spo.load(shipped(name), contacts="ground")
         n, rng = scene.dof_count, np.random.default_rng(0)
         q, qd = np.repeat(scene.neutral_q[None], 10, axis=0), rng.normal(size=(10, n))
         turns = np.concatenate([0.5 * rng.normal(size=(10, 3)), np.ones((10, 1))], axis=1)

@@ -230,7 +230,7 @@ def throws_of_mjlab(dt: float, make: Callable, folder: Path | None = None) -> It
         warnings.simplefilter("ignore")
         own = Path(place) / "g1.xml"
         own.write_text(without_meshes(folder / ROBOTS["G1"]).text)
-        robot = spo.load(own, contacts=True, ground=spo.Plane())
+        robot = spo.load(own, contacts="ground", ground=spo.Plane())
     yield from throw(limp(robot), dt, 16, "limp", 0)
 
 

@@ -146,11 +146,27 @@ def test_patterns_choose_shapes():
     assert [len(c.placements(None)) for c in scene.contacts] == [4, 5] and scene.ground.height == 0.3
 
 
+@pytest.mark.parametrize("source", ["mujoco", "newton", "urdf"])
+def test_ground_is_the_shapes_of_all_bodies(source, urdf):
+    """Points and frictions of "ground" are those of the pattern "*" on the source's own plane; ["ground"] is a name."""
+    read = {
+        "mujoco": lambda contacts: quiet(spo.from_mujoco, compiled(), contacts=contacts),
+        "newton": lambda contacts: quiet(spo.from_newton, newton_model(), contacts=contacts),
+        "urdf": lambda contacts: quiet(spo.load, urdf, floating=True, contacts=contacts),
+    }[source]
+    found, wanted = read("ground"), read("*")
+    assert len(found.contact_points) == len(wanted.contact_points) > 4 and not found.contact_pairs
+    assert [c.label for c in found.contacts] == [c.label for c in wanted.contacts]
+    np.testing.assert_array_equal(found.values["contact_friction"], wanted.values["contact_friction"])
+    with pytest.raises(ValueError, match=r"contacts='ground' matches no collision shape"):
+        read(["ground"])
+
+
 @pytest.mark.parametrize("options, error, words", [
     (dict(contacts="hoof"), ValueError, r"contacts='hoof' matches no collision shape .*'trunk', 'mount', 'shin'"),
     (dict(contacts="skin"), ValueError, "contacts='skin' matches no collision shape"),
-    (dict(contacts=3), TypeError, r"contacts is 3; expected True, a pattern such as '\*foot\*'"),
-    (dict(contacts=[]), TypeError, "expected True"),
+    (dict(contacts=3), TypeError, r"contacts is 3; expected 'ground', True, a pattern such as '\*foot\*'"),
+    (dict(contacts=[]), TypeError, "expected 'ground', True"),
     (dict(contacts="toe", points=0), ValueError, "points is 0; expected an integer, 1 or more"),
     (dict(ground=spo.Plane()), ValueError, "ground is given without contacts"),
 ])  # fmt: skip

@@ -70,6 +70,12 @@ def test_a_warning_names_a_pair(off, pairs):
         spo.from_mujoco(model)
 
 
+def test_contacts_with_the_ground_alone_warn_of_no_bodies(recwarn):
+    model = mujoco.MjModel.from_xml_string(TEXT.format("", ""))
+    assert len(spo.from_mujoco(model, contacts="ground").contacts) == 2
+    assert not recwarn.list
+
+
 def test_no_warning_where_bodies_only_touch_the_ground(recwarn):
     text = TEXT.format("", "").replace('name="palm" size=".1"', 'name="palm" size=".1" contype="2" conaffinity="1"')
     text = text.replace('name="side"', 'name="side" contype="4" conaffinity="1"')

@@ -77,19 +77,19 @@ def test_a_mesh_that_is_missing_touches_nothing(tmp_path):
         spo.load(file, contacts="hoof")
 
 
-@pytest.mark.parametrize("flag", ["contact", "constraint"])
-def test_a_file_that_disables_contacts_is_obeyed(flag, tmp_path):
-    """By True, with a warning; a pattern takes the shapes anyway."""
+@pytest.mark.parametrize("flag, contacts", [("contact", True), ("constraint", "ground")])
+def test_a_file_that_disables_contacts_is_obeyed(flag, contacts, tmp_path):
+    """By True and "ground", with a warning; a pattern takes the shapes anyway."""
     file = tmp_path / "ball.xml"
     body = '<body name="b"><freejoint/><geom name="s" type="sphere" size="0.1"/></body>'
     text = '<mujoco><option>{}</option><worldbody><geom type="plane" size="1 1 1"/>{}</worldbody></mujoco>'
     file.write_text(text.format(f'<flag {flag}="disable"/>', body))
     with pytest.warns(UserWarning, match=r"left out: all contacts, which its options disable .*contacts='\*'"):
-        scene = spo.load(file, contacts=True)
+        scene = spo.load(file, contacts=contacts)
     assert not scene.contacts and scene.ground is None
     assert len(spo.load(file, contacts="*").contacts) == 1
     file.write_text(text.format("", body))
-    assert len(spo.load(file, contacts=True).contacts) == 1
+    assert len(spo.load(file, contacts=contacts).contacts) == 1
 
 
 PENDULUM = """<mujoco><worldbody><geom name="rail" type="capsule" size=".02 1"

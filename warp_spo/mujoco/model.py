@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import UnsupportedError
 from ..scene.actuators import Keyframe
-from ..scene.collision_shapes import NONE, POINTS, ShapeSelection, moving_bodies
+from ..scene.collision_shapes import GROUND, NONE, POINTS, ShapeSelection, moving_bodies
 from ..scene.scene import Scene
 from .actuators import read_actuators
 from .collision_shapes import SOFTNESS, collision_shapes, touching_bodies
@@ -83,7 +83,7 @@ def scene_of(source: Source, floating: bool | None, selection: ShapeSelection = 
     moving = moving_bodies(scene)
     scene, lost = selection.apply(source.title, scene, lambda: collision_shapes(source, moving), complete=True)
     source.left_out += disabled + lost
-    if selection.contacts is not None:
+    if selection.contacts not in (None, GROUND):
         source.left_out += _lost_pairs(source, moving)
     _warn(source, selection.contacts is not None)
     return scene
@@ -188,8 +188,8 @@ def _warn(source: Source, touches: bool) -> None:
         planes = [source.words("geom", int(geom)) for geom in solid if m.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE]
         among = f", {', '.join(planes)} among them" if planes else ""
         grounded = planes or np.any(m.geom_type[solid] == mujoco.mjtGeom.mjGEOM_HFIELD)
-        takes = "contacts=True takes these" if grounded else "contacts=True, ground=spo.Plane() take these and a floor"
-        way = f"scene.with_contacts adds points that touch the ground, {takes}"
+        takes = " takes these" if grounded else ", ground=spo.Plane() take these and a floor"
+        way = f"scene.with_contacts adds points that touch the ground, contacts='ground'{takes}"
         found.append(f"contacts of {solid.size} geom(s){among} ({way})")
     found += _softness(source)
     for mocap in np.flatnonzero(m.body_mocapid >= 0):

@@ -13,7 +13,7 @@ from newton import ShapeFlags
 from ..errors import UnsupportedError
 from ..kernels import declare
 from ..kernels import newton_contacts as kernels
-from ..scene.collision_shapes import ShapeSelection, moving_bodies
+from ..scene.collision_shapes import GROUND, ShapeSelection, moving_bodies
 from ..scene.ground import HEIGHTS
 from ..scene.scene import Scene
 from ..status import Status
@@ -121,7 +121,7 @@ def _on_ground(
     ``named``: indices of shapes that stand still and that pairs have.
     """
     try:
-        made = model_contacts(model, worlds, scene, ShapeSelection(True, None, points), apart, named)
+        made = model_contacts(model, worlds, scene, ShapeSelection(GROUND, None, points), apart, named)
     except UnsupportedError:
         if mode == "ground":
             raise

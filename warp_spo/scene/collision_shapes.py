@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 POINTS = 8
 """Points of a shape that is the hull of points, if the caller does not say."""
+GROUND = "ground"
+"""The choice of the shapes of all bodies that can move, for contacts with the ground alone."""
 UPRIGHT = 0.5  # least cosine between the normal of a ground and the upward direction
 STEEP = ", steeper than 60 degrees"  # what a ground is that is not UPRIGHT
 AXIS_TOLERANCE = 1e-6  # by which axes of a height field may differ from the inertial ones
@@ -129,9 +131,10 @@ class ShapeSelection(NamedTuple):
     """Choice of the shapes of a source that touch the ground, as :func:`warp_spo.load` takes it.
 
     Attributes:
-        contacts: None: none. True, a pattern, several, or points by pattern.
-        ground: None: that of the source, or the plane at height zero; with contacts=True a source that is ``complete``
-            has no ground but its own.
+        contacts: None: none. "ground" or True: those of all bodies that can move. A pattern, several, or points by
+            pattern.
+        ground: None: that of the source, or the plane at height zero; for all bodies a source that is ``complete`` has
+            no ground but its own.
         points: of a hull at most.
     """
 
@@ -159,7 +162,7 @@ class ShapeSelection(NamedTuple):
         Raises:
             ValueError: a pattern matches no shape of a body that can move, a number of points is invalid, or there is a
                 ground without contacts.
-            UnsupportedError: a pattern, not True, matches a shape that no contact represents; or several grounds.
+            UnsupportedError: a pattern matches a shape that no contact represents; or several grounds.
         """
         if not self.wants(call):
             return scene, []
@@ -172,9 +175,17 @@ class ShapeSelection(NamedTuple):
                 error.args = (f"{call}: {error}",)
             raise
 
+    @property
+    def takes_all(self) -> bool:
+        """Whether it takes the shapes of all bodies that can move, not those of patterns."""
+        return self.contacts is True or (isinstance(self.contacts, str) and self.contacts == GROUND)
+
     def unless(self, disabled: bool) -> tuple[ShapeSelection, list[str]]:
-        """Return the selection for a source that may disable contacts, and in words what is left out: True obeys it."""
-        if not disabled or self.contacts is not True:
+        """Return the selection for a source that may disable contacts, and in words what is left out.
+
+        Patterns do not obey it.
+        """
+        if not disabled or not self.takes_all:
             return self, []
         return NONE, ["all contacts, which its options disable (a pattern, such as contacts='*', takes them anyway)"]
 
@@ -182,7 +193,7 @@ class ShapeSelection(NamedTuple):
         """Return whether contacts are wanted; ValueError for a ground without any."""
         if self.contacts is None and self.ground is not None:
             raise ValueError(
-                f"{call}: ground is given without contacts; expected contacts=True or a pattern of names beside it; "
+                f"{call}: ground is given without contacts; expected contacts='ground' or a pattern beside it; "
                 "scene.with_contacts takes contacts of your own"
             )
         return self.contacts is not None
@@ -209,7 +220,7 @@ class ShapeSelection(NamedTuple):
         words = [shape.words(scene.body_labels) for shape in left_out]
         steep = STEEP if ground_shape is not None else f"{STEEP}, so that the ground is the plane z = 0"
         words += [shape.words(scene.body_labels) + (steep if shape.kind in GROUNDS else "") for shape in others]
-        if complete and self.contacts is True and ground is None and not any(shape.kind in GROUNDS for shape in others):
+        if complete and self.takes_all and ground is None and not any(shape.kind in GROUNDS for shape in others):
             words += [NO_GROUND] if selected else []
             selected = []
         for unread in dict.fromkeys(shape.unread for shape, _ in selected if shape.unread):
@@ -230,7 +241,7 @@ class ShapeSelection(NamedTuple):
         most: dict[int, int] = {}  # by index of the shape; the first pattern that matches it counts
         for pattern, count in self._patterns(call).items():
             found = [i for i, shape in enumerate(solid) if shape.matches(pattern, names[shape.body])]
-            if not found and self.contacts is not True:
+            if not found and not self.takes_all:
                 known = ", ".join(dict.fromkeys(quoted(names[shape.body]) for shape in solid)) or "none"
                 raise ValueError(
                     f"{call}: contacts={pattern!r} matches no collision shape of a body that can move; "
@@ -240,7 +251,7 @@ class ShapeSelection(NamedTuple):
                 most.setdefault(i, count)
         selected = [(shape, most[i]) for i, shape in enumerate(solid) if i in most and shape.kind in KINDS]
         others = [shape for i, shape in enumerate(solid) if i in most and shape.kind not in KINDS]
-        if others and self.contacts is not True:
+        if others and not self.takes_all:
             raise UnsupportedError(
                 call,
                 f"contacts={self.contacts!r}, which matches {others[0].words(names)}",
@@ -251,13 +262,13 @@ class ShapeSelection(NamedTuple):
     def _patterns(self, call: str) -> dict[str, int]:
         """Return the most points of a hull by pattern."""
         given = self.contacts
-        patterns = ["*"] if given is True else [given] if isinstance(given, str) else given
+        patterns = ["*"] if self.takes_all else [given] if isinstance(given, str) else given
         if isinstance(patterns, Sequence):
             patterns = dict.fromkeys(patterns, self.points)
         if not isinstance(patterns, Mapping) or not patterns or not all(isinstance(name, str) for name in patterns):
             raise TypeError(
-                f"{call}: contacts is {given!r}; expected True, a pattern such as '*foot*', a list of patterns, or "
-                "points by pattern"
+                f"{call}: contacts is {given!r}; expected 'ground', True, a pattern such as '*foot*', a list of "
+                "patterns, or points by pattern"
             )
         for count in patterns.values():
             if (as_integer(count) or 0) < 1:

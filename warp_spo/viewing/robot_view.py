@@ -313,7 +313,7 @@ class RobotView:
         self.page.close()
 
 
-def view(robot: Any, host: str = HOST, port: int = PORT, contacts: Any = True, **options: Any) -> RobotView:
+def view(robot: Any, host: str = HOST, port: int = PORT, contacts: Any = "ground", **options: Any) -> RobotView:
     """Return the page of a robot, whose address is its ``page.url``; Jupyter shows it inline, ``run()`` serves it.
 
     Args:

@@ -69,17 +69,17 @@ def load(
             In a URDF, links that move as one and have no mass then take it from their collision shapes, 1000 kg/m^3.
             MuJoCo refuses an MJCF file that has such. False keeps the file's numbers; where they make the mass matrix
             singular, results are NaN and ``status=`` says so.
-        contacts: Which collision shapes touch the ground in :meth:`Dynamics.step`: None, none; True, those of all
-            bodies that can move, or none, with a warning, where an MJCF file's options disable contacts; a pattern such
-            as ``"*foot*"``, or a list of patterns, those whose name, or that of their body or mesh, matches
-            (``fnmatch``, in any case; a name also by what follows its last slash); or {pattern: points}. The scene's
-            ``contacts`` hold the result. A sphere and the ends of a capsule touch with their lowest point, a box with
-            its corners. A mesh, a cylinder, a cone and an ellipsoid touch with ``points`` of their surface. Friction is
-            the file's: MuJoCo's of the two geoms, Bullet's ``lateral_friction``, Gazebo's ``mu1``, a USD material's;
-            0.8 where a file has none. Torsional and rolling friction are MuJoCo's with ``condim`` 4 and 6, and Bullet's
-            ``spinning_friction`` and ``rolling_friction``.
+        contacts: Which collision shapes touch the ground in :meth:`Dynamics.step`: None, none; "ground", those of all
+            bodies that can move, or none, with a warning, where an MJCF file's options disable contacts; True, the same
+            today; a pattern such as ``"*foot*"``, or a list of patterns, those whose name, or that of their body or
+            mesh, matches (``fnmatch``, in any case; a name also by what follows its last slash); or {pattern: points}.
+            ``["ground"]`` is a pattern. The scene's ``contacts`` hold the result. A sphere and the ends of a capsule
+            touch with their lowest point, a box with its corners. A mesh, a cylinder, a cone and an ellipsoid touch
+            with ``points`` of their surface. Friction is the file's: MuJoCo's of the two geoms, Bullet's
+            ``lateral_friction``, Gazebo's ``mu1``, a USD material's; 0.8 where a file has none. Torsional and rolling
+            friction are MuJoCo's with ``condim`` 4 and 6, and Bullet's ``spinning_friction`` and ``rolling_friction``.
         ground: The ground that they touch. None: the file's plane or height field; without one, the plane at height
-            zero, but no contacts for contacts=True of an MJCF file, which a warning says.
+            zero, but no contacts for contacts="ground" of an MJCF file, which a warning says.
         points: Of a shape that is the hull of points, at most.
 
     Raises:
@@ -89,7 +89,7 @@ def load(
         ImportError: A package for meshes or USD is missing. The message names the extra that installs it.
         UnsupportedError, DirectedLoopError: As :func:`from_newton` and :func:`from_mujoco`.
         UnsupportedError: A pattern of ``contacts`` names a shape that no contact represents, or the file has several
-            grounds and ``ground`` does not choose. With contacts=True, such shapes are left out, with a warning.
+            grounds and ``ground`` does not choose. With contacts="ground", such shapes are left out, with a warning.
 
     Warns:
         UserWarning: A mass or an inertia was replaced, or taken from shapes. The message names the bodies. A mimic in a
