@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -84,12 +85,17 @@ def speed(env: Env, policy: Policy) -> dict[str, float]:
             "early ends": float(found["ended"].float().mean())}  # fmt: skip
 
 
-def reach(env: Env, policy: Policy, frame: str, period: float) -> dict[str, float]:
-    """Return the share of places that a frame has reached within 1 cm when the next is named, and errors [m]."""
+def reach(env: Env, policy: Policy, frame: str) -> dict[str, float]:
+    """Return the share of places that a frame has reached within 1 cm when the next is named, and errors [m].
+
+    Places of the first episode of each world are counted, but the last, which no other follows.
+    """
     pose = lambda env: env.dyn.frame_poses(env.q, [frame])[:, 0, :3]  # noqa: E731
     read = {"error": lambda env: (pose(env) - env.command).norm(dim=1), "command": lambda env: env.command}
     found = roll(env, policy, env.max_episode_length - 1, read)
-    changes = (found["command"][1:] != found["command"][:-1]).any(dim=2)
+    changes = (found["command"][1:] != found["command"][:-1]).any(dim=2) & found["valid"][1:]
+    if not changes.any():
+        return {"places": 0, "within 1 cm": math.nan, "median error": math.nan, "95 % error": math.nan}
     last = found["error"][:-1][changes]
     return {"places": int(changes.sum()), "within 1 cm": float((last < 0.01).float().mean()),
             "median error": float(last.median()), "95 % error": float(last.quantile(0.95))}  # fmt: skip

@@ -182,7 +182,11 @@ def peak_memory(device: Any) -> dict[str, float]:
 
 
 def lines_of(rows: list[dict[str, float]]) -> bytes:
-    """Return rows as the lines of a ``progress.jsonl``, without the terms that ended no world as not finite."""
+    """Return rows as the lines of a ``progress.jsonl``.
+
+    A row counts by term the worlds that ended because a number was not finite or beyond its bounds; terms that count
+    zero are left out, the totals stay.
+    """
 
     def told(name: str, value: float) -> bool:
         return value != 0.0 or name.count("/") < 3 or not name.startswith(KINDS_OF_FAULTS)
