@@ -13,6 +13,7 @@ import torch
 from ..scene.scene import Scene
 from ..viewing import films, shapes
 from . import robots
+from .compile.memory_layout import count_steps
 from .environment import Env
 from .evaluation import hold
 from .validation import check_number, check_whole
@@ -51,7 +52,7 @@ def record(env: Env, policy: Any, seconds: float, command: Any = None, world: in
     with hold(env, command):
         observed, _ = env.reset()
         env.episode_length_buf = torch.zeros_like(env.episode_length_buf)
-        for _ in range(round(seconds / env.step_dt)):
+        for _ in range(count_steps(seconds, env.step_dt)):
             observed, _, _, _ = env.step(policy(observed))
             for rows, values in zip(states, (env.q, env.qd, env.command if commanded else env.q), strict=True):
                 rows.append(values[world].cpu().numpy().copy())
