@@ -15,6 +15,7 @@ from warp_spo.env import evaluation, learning, observations, robots, training_lo
 from warp_spo.env.tasks import TASKS, go2_flat, go2_rough, task, velocity  # noqa: E402
 from warp_spo.viewing import Camera, Primitive, films  # noqa: E402
 from warp_spo.viewing.renderer import Renderer  # noqa: E402
+from warp_spo.viewing.surfaces import primitive_surface  # noqa: E402
 
 
 def roll(env, steps, seed=0):
@@ -213,6 +214,23 @@ def test_a_sphere_is_drawn_where_it_is():
     radius = 100 * np.tan(np.arcsin(0.3 / 4.0)) / np.tan(0.25)
     assert np.allclose(red.mean(axis=0), 99.5, atol=0.5)
     assert len(red) == pytest.approx(np.pi * radius**2, rel=0.03)
+
+
+@pytest.mark.parametrize(("kind", "size", "area"), [
+    ("cylinder", (0.3, 0.2), 2 * 0.3 * 2 * 0.2),
+    ("cone", (0.3, 0.2), 0.3 * 2 * 0.2),
+    ("ellipsoid", (0.3, 0.2, 0.1), np.pi * 0.3 * 0.1),
+])  # fmt: skip
+@pytest.mark.parametrize("triangles", [False, True])
+def test_a_round_shape_is_drawn_with_its_outline(kind, size, area, triangles):
+    """From far away a picture of its side has the area of its outline: contacts' shapes, and those of a file."""
+    camera = Camera(distance=20.0, azimuth=-0.5 * np.pi, elevation=0.0, width=240, height=160, view=0.05)
+    shape = Primitive(kind, -1, size, (0, 0, 1, 0, 0, 0, 1), (1.0, 0.0, 0.0))
+    renderer = Renderer([primitive_surface(shape) if triangles else shape], 0, None, camera)
+    picture = renderer.draw(np.zeros((0, 7)), np.array([0.0, 0.0, 1.0])).astype(int)
+    red = (picture[..., 0] > picture[..., 1] + 60).sum()
+    pixel = 2 * 20.0 * np.tan(0.025) / 160
+    assert red * pixel**2 == pytest.approx(area, rel=0.05)  # 20 edges about the axis, and whole pixels
 
 
 def test_the_ground_is_drawn_where_it_is():

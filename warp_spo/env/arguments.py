@@ -11,6 +11,7 @@ from ..errors import UnsupportedError, is_bool, shown
 from ..scene.scene import Scene
 from .bounds import Bounds
 from .compile.guard import BEYOND, NOT_FINITE
+from .compile.memory_layout import count_steps
 from .curricula import ends_of
 from .observations import Observation, TorchTerm
 from .validation import check_function, check_mapping, check_number, check_whole
@@ -72,7 +73,7 @@ def checked_times(dt: Any, decimation: Any, episode_length_s: Any) -> tuple[floa
     for name, value in (("dt", dt), ("episode_length_s", episode_length_s)):
         if check_number("Env", name, value) <= 0.0:
             raise ValueError(f"Env: {name} is {value!r} s; expected more than zero")
-    return float(dt), steps, max(1, round(episode_length_s / (float(dt) * steps)))
+    return float(dt), steps, count_steps(episode_length_s, float(dt) * steps)
 
 
 def checked_default(scene: Scene, default_q: Any) -> np.ndarray:

@@ -68,7 +68,7 @@ class Env(VecEnv):
         metrics: terms by name whose means over episodes are logged; nothing else depends on them.
         commands: None, or one of :mod:`warp_spo.env.commands`.
         events: of :mod:`warp_spo.env.events`.
-        episode_length_s: after this time an episode ends with a time-out [s].
+        episode_length_s: after this time, rounded up to whole steps, an episode ends with a time-out [s].
         default_q: coordinates [coordinate] of starts, to which joints and actions are relative; None: the scene's.
         seed: of all random numbers, 64 bits.
         first_world: number of world 0 in a run on several devices; a world's numbers depend on its own number alone.
