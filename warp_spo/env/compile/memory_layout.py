@@ -134,7 +134,7 @@ class MemoryLayout:
         steps = seconds / self.step_dt
         return round(steps) if abs(steps - round(steps)) <= ROUNDING * max(1.0, steps) else steps
 
-    def grown(self, name: str) -> Any:
+    def update_level(self, name: str) -> Any:
         """Return what a world remembers of a level after the step that "judge" looks at, which keeps it."""
         w, ended = self.judged  # type: ignore[misc]
         if name not in w.kept:
