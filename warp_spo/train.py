@@ -106,7 +106,7 @@ def start(given: list[str]) -> int:
             before = None if options.resume is None else options.resume.parent
         run, tree = settings.gather(before, short_name(options.task), options.settings, options.changes)
         own, options.given = settings.split(tree)
-        learner = settings.changed(chosen.LEARNER, own, "learner")
+        learner = settings.apply(chosen.LEARNER, own, "learner")
     except (ValueError, OSError) as error:
         parser.error(str(error))
     options.gpus = options.gpus or run.get("processes", 1)

@@ -321,6 +321,18 @@ def test_measures_of_a_known_course():
     assert found["worlds"] == 4 and found["upright"] == 2 and found["least share"] == 0.0
 
 
+def test_a_new_start_is_no_place_that_was_reached():
+    """A world that ends early names another place as it starts anew; no command of its first episode changed before."""
+    env = envs.make("panda-reach", 2, "cpu")
+
+    def policy(observed):
+        env.qd[0] = 1e9 if int(env.episode_length_buf[0]) == 5 else 0.0  # beyond its bounds: the world ends
+        return torch.zeros(2, env.num_actions)
+
+    found = evaluation.reach(env, policy, "hand")
+    assert found["places"] == 3  # of the other world, whose episode has four
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TASKS)
 def test_every_task_steps(name):

@@ -145,7 +145,7 @@ class MemoryLayout:
         """Return a time in steps of the environment, a whole number where it is one but for rounding."""
         return as_steps(seconds, self.step_dt)
 
-    def grown(self, name: str) -> Any:
+    def update_level(self, name: str) -> Any:
         """Return what a world remembers of a level after the step that "judge" looks at, which keeps it."""
         w, ended = self.judged  # type: ignore[misc]
         if name not in w.kept:

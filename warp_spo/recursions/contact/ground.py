@@ -129,7 +129,7 @@ class Corners(NamedTuple):
 
     @classmethod
     def of(
-        cls, graph: Graph, ground: HeightField, place: GroundOffset, i: Value, j: Value, together: bool = True
+        cls, graph: Graph, ground: HeightField, place: GroundOffset, i: Value, j: Value, by_cell_table: bool = True
     ) -> Corners:
         """Return the corners of the cell (i, j) of a world's field, from the table of cells or, one by one, of heights.
 
@@ -139,7 +139,7 @@ class Corners(NamedTuple):
         first = i * float(columns) + j
         if ground.count > 1:
             first = floor(clamp(place.field, ground.count - 1.0)) * float(rows * columns) + first
-        if together:
+        if by_cell_table:
             h00, h01, h10, h11 = lookup(graph, GROUND, first, CORNERS)
         else:
             h00, h01, h10, h11 = (entry(graph, SINGLE, first, step) for step in corner_steps(ground))
@@ -207,11 +207,11 @@ def by_cell(heights: np.ndarray) -> np.ndarray:
 
 
 def height(
-    graph: Graph, ground: Plane | HeightField, x: Value, y: Value, place: GroundOffset, together: bool = True
+    graph: Graph, ground: Plane | HeightField, x: Value, y: Value, place: GroundOffset, by_cell_table: bool = True
 ) -> Value:
     """Return the height of the ground at a point of the horizontal plane [m]; the plane must not be vertical.
 
-    ``together``: as :meth:`Corners.of`.
+    ``by_cell_table``: as :meth:`Corners.of`.
     """
     x, y = x - place.origin[0], y - place.origin[1]
     if isinstance(ground, Plane):
@@ -220,7 +220,7 @@ def height(
     rows, columns = ground.heights.shape[-2:]
     i, s = _cell((x - ground.origin[0]) * (1.0 / ground.cells[0]), rows)
     j, t = _cell((y - ground.origin[1]) * (1.0 / ground.cells[1]), columns)
-    cell = Corners.of(graph, ground, place, i, j, together)
+    cell = Corners.of(graph, ground, place, i, j, by_cell_table)
     return cell.base + cell.run * s + (cell.rise + cell.twist * s) * t + (ground.origin[2] + place.origin[2])
 
 
