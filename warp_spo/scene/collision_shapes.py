@@ -170,7 +170,7 @@ class ShapeSelection(NamedTuple):
             found = self.resolve(call, scene, shapes(), touches, material_rule, complete)
             contacts = [one for _, made in found.contacts_by_shape for one in made]
             return scene.with_contacts(contacts, found.ground), found.left_out
-        except ValueError as error:  # of a contact, which knows neither the call nor the file
+        except (ValueError, TypeError) as error:  # of a contact, which knows neither the call nor the file
             if not str(error).startswith(call):
                 error.args = (f"{call}: {error}",)
             raise
@@ -190,12 +190,14 @@ class ShapeSelection(NamedTuple):
         return NONE, ["all contacts, which its options disable (a pattern, such as contacts='*', takes them anyway)"]
 
     def wants(self, call: str) -> bool:
-        """Return whether contacts are wanted; ValueError for a ground without any."""
+        """Return whether contacts are wanted; ValueError for a ground without any, errors of patterns and points."""
         if self.contacts is None and self.ground is not None:
             raise ValueError(
                 f"{call}: ground is given without contacts; expected contacts='ground' or a pattern beside it; "
                 "scene.with_contacts takes contacts of your own"
             )
+        if self.contacts is not None:
+            self._patterns(call)
         return self.contacts is not None
 
     def resolve(
@@ -268,7 +270,7 @@ class ShapeSelection(NamedTuple):
         if not isinstance(patterns, Mapping) or not patterns or not all(isinstance(name, str) for name in patterns):
             raise TypeError(
                 f"{call}: contacts is {given!r}; expected 'ground', True, a pattern such as '*foot*', a list of "
-                "patterns, or points by pattern"
+                "patterns, or points by pattern; None, for no contacts"
             )
         for count in patterns.values():
             if (as_integer(count) or 0) < 1:
