@@ -177,15 +177,15 @@ def test_what_cannot_be_chosen_is_an_error(options, error, words):
 
 def test_what_is_left_out_is_said_by_name():
     with pytest.warns(UserWarning, match=r"left out: box 'table' of the world$"):
-        spo.from_mujoco(compiled(), contacts=True)
+        spo.from_mujoco(compiled(), contacts="ground")
     wall = MJCF.replace('euler="0 0 10"', 'zaxis="1 0 0"')
     words = "plane 'floor' of the world, steeper than 60 degrees, so that the ground is the plane z = 0; box 'table' of"
     with pytest.warns(UserWarning, match=f"left out: {words} the world$"):
-        scene = spo.from_mujoco(compiled(wall), contacts=True)
+        scene = spo.from_mujoco(compiled(wall), contacts="ground")
     assert scene.ground.height == 0.0
     two = MJCF.replace('<geom name="table"', '<geom name="hill" type="hfield" hfield="hills"/><geom name="table"')
     with pytest.raises(spo.UnsupportedError, match="several grounds: plane 'floor' of the world, height field 'hill'"):
-        quiet(spo.from_mujoco, compiled(two), contacts=True)
+        quiet(spo.from_mujoco, compiled(two), contacts="ground")
 
 
 def test_a_height_field_lies_where_mujoco_has_it():

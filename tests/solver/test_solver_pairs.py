@@ -12,7 +12,7 @@ from support.solver_pair_models import arm, config, free_cube, many, mesh_of, wi
 from warp_spo.errors import UnsupportedError
 from warp_spo.examples import newton_grasp
 from warp_spo.newton import SolverSPO
-from warp_spo.newton.pairs import ModelPairs, warn_of_bodies_apart
+from warp_spo.newton.pairs import find_pairs, warn_of_bodies_apart
 from warp_spo.newton.worlds import WorldRows
 
 
@@ -64,7 +64,7 @@ def test_what_steps_cannot_do_has_a_name():
 
 def chosen(model, asked):
     """Return the labels of the pairs that a solver would take, without building it."""
-    pairs = ModelPairs(model, WorldRows(model), spo.from_newton(model), asked)
+    pairs = find_pairs(model, WorldRows(model), spo.from_newton(model), asked, "")
     return [contact.label for contact in pairs._contacts], pairs
 
 

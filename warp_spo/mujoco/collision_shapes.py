@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from typing import Any
 
 import mujoco
@@ -13,6 +12,7 @@ from ..scene.collision_shapes import CollisionShape
 from ..scene.contact_shapes import SHAPES, kinds_in
 from ..scene.contacts import FRICTIONS
 from ..scene.ground import HeightField
+from ..scene.shape_pairs import ShapePair
 from .mechanism import xyzw
 from .source import Source
 
@@ -21,7 +21,8 @@ GEOMS = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")): name.lower() for name i
 """MuJoCo's kinds by number."""
 SOFTNESS = {"solref": (0.02, 1.0), "solreffriction": (0.0, 0.0), "solimp": (0.9, 0.95, 0.001, 0.5, 2.0)}
 """How soft a contact of MuJoCo is where a file does not say."""
-Pairs = dict[frozenset[int], int]  # number of an explicit pair by its two geoms
+Pairs = dict[frozenset[int], int]
+"""Numbers of explicit pairs by their two geoms."""
 KINDS = {"hfield": "height field", **{name.lower(): kind for name, kind in kinds_in("mujoco").items()}}
 
 
@@ -36,21 +37,19 @@ def collision_shapes(source: Source, moving: np.ndarray) -> list[CollisionShape]
     geoms' or that of their pair, because MuJoCo pushes two surfaces apart until they are so far from each other.
     """
     m = source.model
-    pairs = _pairs(source)
-    solid = {int(geom) for geom in np.flatnonzero(m.geom_contype | m.geom_conaffinity)}
-    solid |= {geom for pair in pairs for geom in pair}
+    pairs, solid = explicit_pairs(source), solid_geoms(source)
     still = lambda geom: m.geom_bodyid[geom] == 0 or not moving[m.geom_bodyid[geom] - 1]  # noqa: E731
-    grounds = [geom for geom in sorted(solid) if still(geom) and _name(m, geom) in ("plane", "hfield")]
+    grounds = [geom for geom in solid if still(geom) and _name(m, geom) in ("plane", "hfield")]
     found = []
-    for geom in sorted(solid):
-        touched = [ground for ground in grounds if _touches(source, geom, ground, pairs)]
+    for geom in solid:
+        touched = [ground for ground in grounds if is_explicit_or_masked(source, geom, ground, pairs)]
         if grounds and not still(geom) and not touched:
             continue  # it collides with other things than the ground
         if still(geom):
-            found.append(_shape(source, geom, None, 0.0))
+            found.append(geom_shape(source, geom, None, 0.0))
             continue
         ground = touched[0] if touched else None
-        shape = _shape(source, geom, None, _margin(source, geom, ground, pairs))
+        shape = geom_shape(source, geom, None, _margin(source, geom, ground, pairs))
         material = _frictions(source, geom, ground, pairs)
         found.append(dataclasses.replace(shape, **material, unread=_unread_softness(source, geom, ground, pairs)))
     return found
@@ -60,53 +59,48 @@ def _name(m: Any, geom: int) -> str:
     return GEOMS.get(int(m.geom_type[geom]), f"geom of type {int(m.geom_type[geom])}")
 
 
-def _pairs(source: Source) -> Pairs:
+def solid_geoms(source: Source) -> list[int]:
+    """Return the geoms that may touch anything, by masks or by a pair."""
+    m = source.model
+    solid = {int(geom) for geom in np.flatnonzero(m.geom_contype | m.geom_conaffinity)}
+    return sorted(solid | {geom for pair in explicit_pairs(source) for geom in pair})
+
+
+def explicit_pairs(source: Source) -> Pairs:
     """Return the explicit pairs of geoms: number of the pair by its geoms."""
     m = source.model
     return {frozenset((int(m.pair_geom1[i]), int(m.pair_geom2[i]))): i for i in range(m.npair)}
 
 
-def _touches(source: Source, geom: int, ground: int, pairs: Pairs) -> bool:
-    """Whether MuJoCo makes contacts of a geom with a geom of the world: by masks or by a pair, unless excluded."""
+def is_explicit_or_masked(source: Source, geom: int, ground: int, pairs: Pairs) -> bool:
+    """Whether MuJoCo makes contacts of two geoms: by a pair, or by masks, unless the file excludes their bodies.
+
+    Geoms of one rigid piece, and of one and its parent, count as any others.
+    """
     m = source.model
     if frozenset((geom, ground)) in pairs:
         return True
-    body, other = sorted((int(m.geom_bodyid[geom]), int(m.geom_bodyid[ground])))
-    if (body << 16) + other in m.exclude_signature.tolist() or (other << 16) + body in m.exclude_signature.tolist():
+    if not m.geom_contype[geom] & m.geom_conaffinity[ground] | m.geom_contype[ground] & m.geom_conaffinity[geom]:
         return False
-    return bool(m.geom_contype[geom] & m.geom_conaffinity[ground] | m.geom_contype[ground] & m.geom_conaffinity[geom])
+    bodies = sorted((int(m.geom_bodyid[geom]), int(m.geom_bodyid[ground])))
+    signatures = {(a << 16) + b for a, b in (bodies, bodies[::-1])}
+    return signatures.isdisjoint(m.exclude_signature.tolist())
 
 
-def touching_bodies(source: Source, moving: np.ndarray) -> tuple[int, int] | None:
-    """Return two geoms, of two bodies that move, that MuJoCo lets touch each other; None where there are none.
-
-    Explicit pairs count, then masks, by MuJoCo's rules: not of one rigid piece, nor of a piece and its parent, unless
-    the file disables ``filterparent``, nor of bodies that ``<exclude>`` names.
-    """
-    m, piece = source.model, np.array(source.model.body_weldid)
-    above = piece[m.body_parentid[piece]]
-    moves = np.concatenate([[False], moving[: m.nbody - 1]])[m.geom_bodyid]
-    for one, other in ((int(a), int(b)) for a, b in zip(m.pair_geom1, m.pair_geom2, strict=True)):
-        if moves[one] and moves[other] and piece[m.geom_bodyid[one]] != piece[m.geom_bodyid[other]]:
-            return one, other
-    excluded = {frozenset(divmod(int(pair), 1 << 16)) for pair in m.exclude_signature}
-    kinds: dict[tuple[int, int], dict[int, int]] = {}  # by masks: a geom of each body
-    for geom in np.flatnonzero((m.geom_contype | m.geom_conaffinity).astype(bool) & moves):
-        masks = int(m.geom_contype[geom]), int(m.geom_conaffinity[geom])
-        kinds.setdefault(masks, {}).setdefault(int(m.geom_bodyid[geom]), int(geom))
-    for (a, b), (c, d) in itertools.combinations_with_replacement(kinds, 2):
-        if not (a & d or b & c):
-            continue
-        for one, other in itertools.product(kinds[a, b], kinds[c, d]):  # all but a few of them may touch: soon found
-            first, second = int(piece[one]), int(piece[other])
-            related = not source.disabled("FILTERPARENT") and (above[one] == second or above[other] == first)
-            if first != second and not related and frozenset((one, other)) not in excluded:
-                return kinds[a, b][one], kinds[c, d][other]
-    return None
+def pair_of_geoms(source: Source, one: CollisionShape, other: CollisionShape, pairs: Pairs) -> ShapePair:
+    """Return two shapes that touch each other with what MuJoCo gives to their contact, in the first of them."""
+    a, b = one.index, other.index
+    explicit = frozenset((a, b)) in pairs or source.enabled("OVERRIDE")
+    margin, lent = (
+        (_margin(source, a, b, pairs), 0.0) if explicit else (_margin(source, g, None, pairs) for g in (a, b))
+    )
+    unread = _unread_softness(source, a, b, pairs)
+    first = dataclasses.replace(one, **_frictions(source, a, b, pairs), rounding=margin, unread=unread)
+    return ShapePair(first, dataclasses.replace(other, rounding=lent))
 
 
 def _frictions(source: Source, geom: int, ground: int | None, pairs: Pairs) -> dict[str, Any]:
-    """Return sliding, torsional and rolling friction of a geom on a ground, its own without one."""
+    """Return sliding, torsional and rolling friction of a geom on a ground or another geom, its own without one."""
     m = source.model
     pair = None if ground is None else pairs.get(frozenset((geom, ground)))
     if pair is not None:
@@ -156,7 +150,7 @@ def _margin(source: Source, geom: int, ground: int | None, pairs: Pairs) -> floa
     return float(sum(m.geom_margin[g] for g in (geom, ground) if g is not None))
 
 
-def _shape(source: Source, geom: int, friction: float | None, margin: float) -> CollisionShape:
+def geom_shape(source: Source, geom: int, friction: float | None, margin: float) -> CollisionShape:
     m, kind = source.model, source.missing.get(geom) or _name(source.model, geom)
     names: tuple[str, ...] = ()
     if kind in ("mesh", "hfield"):
@@ -170,6 +164,7 @@ def _shape(source: Source, geom: int, friction: float | None, margin: float) -> 
         rounding=margin,
         friction=friction,
         names=names,
+        index=geom,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -11,17 +12,18 @@ import numpy as np
 
 from ..errors import UnsupportedError
 from ..scene.actuators import Keyframe
-from ..scene.collision_shapes import GROUND, NONE, POINTS, ShapeSelection, moving_bodies
+from ..scene.collision_shapes import NONE, POINTS, ShapeSelection, moving_bodies
 from ..scene.scene import Scene
 from .actuators import read_actuators
-from .collision_shapes import SOFTNESS, collision_shapes, touching_bodies
+from .collision_shapes import SOFTNESS, collision_shapes
 from .equality_constraints import read_equality_constraints
+from .geom_pairs import geom_pairs
 from .mechanism import BALL, FREE, SIZES, Mechanism, rotation, scene_entries, xyzw
 from .source import Source
 from .unsupported_features import refuse_unsupported
 
 
-def from_mujoco(model: Any, contacts: Any = None, ground: Any = None, points: int = POINTS) -> Scene:
+def from_mujoco(model: Any, contacts: Any = None, ground: Any = None, points: int = POINTS, pairs: Any = None) -> Scene:
     """Return the scene of a compiled MuJoCo model, its numbers in float64.
 
     Every joint becomes a hinge of its own, in the model's order and with the model's name; a body without a joint has a
@@ -40,9 +42,10 @@ def from_mujoco(model: Any, contacts: Any = None, ground: Any = None, points: in
 
     Args:
         model: a ``mujoco.MjModel``, of MuJoCo 3.11 or newer.
-        contacts, ground, points: which geoms touch which ground, as in :func:`load`. Friction and margin are those of
-            the geom on MuJoCo's ground; stiffness and damping are chosen as :class:`Contact` says. A warning names
-            the geoms whose contact has another ``solref`` or ``solimp`` than MuJoCo's default.
+        contacts, ground, points, pairs: which geoms touch which ground or each other, as in :func:`load`. Friction and
+            margin are those of the geom on MuJoCo's ground, or of the pair of geoms; stiffness and damping are chosen
+            as :class:`Contact` says. A warning names the geoms whose contact has another ``solref`` or ``solimp`` than
+            MuJoCo's default.
 
     Raises:
         TypeError: the argument is not a ``mujoco.MjModel``.
@@ -62,7 +65,7 @@ def from_mujoco(model: Any, contacts: Any = None, ground: Any = None, points: in
             f"from_mujoco: got {type(model).__name__}; expected mujoco.MjModel, which "
             "mujoco.MjModel.from_xml_path(path) and mujoco.MjSpec.compile() return"
         )
-    return scene_of(Source(model), None, ShapeSelection(contacts, ground, points))
+    return scene_of(Source(model), None, ShapeSelection(contacts, ground, points, pairs))
 
 
 def scene_of(source: Source, floating: bool | None, selection: ShapeSelection = NONE) -> Scene:
@@ -81,11 +84,15 @@ def scene_of(source: Source, floating: bool | None, selection: ShapeSelection = 
         raise ValueError(f"{source.title}: {error}; correct the model") from None
     selection, disabled = selection.unless(source.disabled("CONTACT") or source.disabled("CONSTRAINT"))
     moving = moving_bodies(scene)
-    scene, lost = selection.apply(source.title, scene, lambda: collision_shapes(source, moving), complete=True)
+    scene, lost = selection.apply(
+        source.title,
+        scene,
+        lambda: collision_shapes(source, moving),
+        complete=True,
+        pairs=functools.partial(geom_pairs, source, scene),
+    )
     source.left_out += disabled + lost
-    if selection.contacts not in (None, GROUND):
-        source.left_out += _lost_pairs(source, moving)
-    _warn(source, selection.contacts is not None)
+    _warn(source, bool(scene.contacts) or selection.contacts is not None)
     return scene
 
 
@@ -168,15 +175,6 @@ def _listed(source: Source, kind: str, indices: np.ndarray) -> str:
     """Return the first eight of some elements in words, and the number of the others."""
     more = f" and {len(indices) - 8} more" if len(indices) > 8 else ""
     return ", ".join(source.words(kind, int(index)) for index in indices[:8]) + more
-
-
-def _lost_pairs(source: Source, moving: np.ndarray) -> list[str]:
-    """Return in words that bodies which touch each other in MuJoCo do not here, nothing if there are none."""
-    found = touching_bodies(source, moving)
-    if found is None:
-        return []
-    words = " with ".join(source.words("geom", geom) for geom in found)
-    return [f"contacts between bodies, such as {words} (spo.Contact(other=) adds the pairs that matter)"]
 
 
 def _warn(source: Source, touches: bool) -> None:

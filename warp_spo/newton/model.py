@@ -19,13 +19,15 @@ from ..recursions.step.joint_laws import DEFAULT_BOUND
 from ..scene.collision_shapes import POINTS, ShapeSelection
 from ..scene.parts import DOF_VALUES, UNLIMITED, Body, Coupling, Hinge, Loop, checked_inertia
 from ..scene.scene import Scene
-from .model_contacts import with_model_contacts
+from .pairs import with_model_contacts
 from .worlds import KINDS, WorldRows, flat_entries, quote_labels, to_numpy, unit_pose
 
 ASYMMETRY = 1e-6  # relative asymmetry of an inertia that counts as rounding: R I R^T in float32 leaves a few 1e-7
 
 
-def from_newton(model: newton.Model, contacts: Any = None, ground: Any = None, points: int = POINTS) -> Scene:
+def from_newton(
+    model: newton.Model, contacts: Any = None, ground: Any = None, points: int = POINTS, pairs: Any = None
+) -> Scene:
     """Return the scene of a finalized model.
 
     Bodies and hinges keep the order that the model's bodies and tree joints have within a world. Labels are those of
@@ -42,7 +44,8 @@ def from_newton(model: newton.Model, contacts: Any = None, ground: Any = None, p
 
     Args:
         model: The model.
-        contacts, ground, points: Which shapes touch which ground, as in :func:`load`. ``ke``, ``kd`` and ``mu`` of a
+        contacts, ground, points, pairs: Which shapes touch which ground or each other, as in :func:`load`; pairs are
+            those that the model's groups and filters let collide. ``ke``, ``kd`` and ``mu`` of a
             shape's material are stiffness [N/m], damping [N s/m] and friction of each of its points, the mean of the
             shape's and the ground's if the ground is the model's; a margin lies around its surface.
 
@@ -78,7 +81,7 @@ def from_newton(model: newton.Model, contacts: Any = None, ground: Any = None, p
     differing = {name: array for name, array in values.items() if (array != array[:1]).any()}
     scene = scene.with_values(**differing)
     scene.q_index, scene.dof_index = q_index, dof_index
-    return with_model_contacts(model, worlds, scene, ShapeSelection(contacts, ground, points))
+    return with_model_contacts(model, worlds, scene, ShapeSelection(contacts, ground, points, pairs))
 
 
 def _values(worlds: WorldRows, q_index: np.ndarray, dof_index: np.ndarray) -> dict[str, np.ndarray]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import warnings
 from collections.abc import Collection
 from typing import Any, NamedTuple
 
@@ -273,16 +272,6 @@ def model_contacts(
         if turning.any():
             values[name] = turning[:1] if (turning == turning[:1]).all() else turning
     return made._replace(scene=scene.with_values(**values))
-
-
-def with_model_contacts(model: newton.Model, worlds: WorldRows, scene: Scene, selection: ShapeSelection) -> Scene:
-    """Return the scene, with contacts of chosen shapes of a model if some are wanted; warn of what is left out."""
-    if not selection.wants("from_newton"):
-        return scene
-    made = model_contacts(model, worlds, scene, selection)
-    if made.selected.left_out:
-        warnings.warn(f"from_newton: left out: {', '.join(made.selected.left_out)}", UserWarning, stacklevel=3)
-    return made.scene
 
 
 def turns(model: newton.Model) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import warnings
 from typing import Any
 
@@ -12,12 +13,13 @@ import warp as wp
 from ..errors import UnsupportedError
 from ..kernels import declare
 from ..kernels import newton_contacts as kernels
+from ..scene.collision_shapes import ShapeSelection
 from ..scene.contact_checks import unsaid_softness
 from ..scene.contact_values import TURNING_VALUES
 from ..scene.ground import GROUND_VALUES
 from ..scene.scene import Scene
-from ..scene.shape_pairs import PairSelection
-from .model_contacts import CONTACT_MATERIALS, ModelShapes
+from ..scene.shape_pairs import PairSelection, ShapePair
+from .model_contacts import CONTACT_MATERIALS, ModelShapes, model_contacts
 from .worlds import WorldRows
 
 
@@ -28,18 +30,29 @@ def find_pairs(model: newton.Model, worlds: WorldRows, scene: Scene, asked: Any,
         asked: "all", pairs of names, an empty list, or None. lacking: why steps have no contacts, "" if they do.
 
     Raises:
-        UnsupportedError: steps have no contacts; or as :class:`ModelPairs`.
+        TypeError, ValueError, UnsupportedError: Steps have no contacts; as :meth:`PairSelection.resolve`; or the worlds
+            have different shapes.
     """
     if asked is None or (isinstance(asked, list | tuple) and not asked):
         return None
     if lacking:
         raise UnsupportedError("SolverSPO", f"pairs={asked!r} with {lacking}", "leave out one of them")
-    return ModelPairs(model, worlds, scene, asked)
+    shapes = ModelShapes(model, worlds)
+    selection = select_pairs("SolverSPO", shapes, scene)
+    pairs, left_out = selection.resolve(asked)
+    if left_out:
+        more = f" and {len(left_out) - 4} more" if len(left_out) > 4 else ""
+        warnings.warn(
+            f"SolverSPO: pairs='all' leaves out {', '.join(left_out[:4])}{more}, which no contact represents",
+            UserWarning,
+            stacklevel=4,
+        )
+    return ModelPairs(shapes, pairs, selection)
 
 
 def warn_of_bodies_apart(model: newton.Model, worlds: WorldRows, scene: Scene) -> None:
     """Warn if bodies of separate trees may collide by a model's filters: they pass through each other."""
-    found = _select_pairs(ModelShapes(model, worlds), scene).first_of_separate_trees()
+    found = select_pairs("SolverSPO", ModelShapes(model, worlds), scene).first_of_separate_trees()
     if found is not None:
         warnings.warn(
             f"SolverSPO: bodies that no joint connects pass through each other, such as "
@@ -55,7 +68,7 @@ def refuse_still(model: newton.Model, worlds: WorldRows, scene: Scene, named: fr
 
     A list of contacts would have those of pairs, too.
     """
-    selection = _select_pairs(ModelShapes(model, worlds), scene)
+    selection = select_pairs("SolverSPO", ModelShapes(model, worlds), scene)
     others = [shape for shape in selection.shapes if not selection.moves(shape) and shape.index not in named]
     if others:
         raise UnsupportedError(
@@ -66,44 +79,47 @@ def refuse_still(model: newton.Model, worlds: WorldRows, scene: Scene, named: fr
         )
 
 
-def _select_pairs(shapes: ModelShapes, scene: Scene) -> PairSelection:
-    """Return what chooses pairs of a model's shapes."""
+def select_pairs(call: str, shapes: ModelShapes, scene: Scene, takes_still: bool = False) -> PairSelection:
+    """Return what chooses pairs of a model's shapes, by its collision groups and filters."""
     first = shapes.first() if shapes.model.shape_count else []
-    return PairSelection("SolverSPO", scene, first, shapes.touches, {shape.index: shape for shape in first})
+    numbers = {shape.index: shape for shape in first}
+    return PairSelection(call, scene, first, shapes.touches, numbers, takes_still=takes_still)
+
+
+def with_model_contacts(model: newton.Model, worlds: WorldRows, scene: Scene, selection: ShapeSelection) -> Scene:
+    """Return the scene, with contacts of chosen shapes of a model if some are wanted; warn of what is left out."""
+    shapes = functools.cache(lambda: ModelShapes(model, worlds))
+    between = functools.cache(lambda: select_pairs("from_newton", shapes(), scene, takes_still=True))
+    touching, lost = selection.body_pairs(between)
+    pairs, left_out = ModelPairs(shapes(), touching, between()) if touching else None, list[str]()
+    if selection.wants("from_newton"):
+        made = model_contacts(model, worlds, scene, selection, without=frozenset() if pairs is None else pairs.still)
+        scene, left_out = made.scene, made.selected.left_out
+    if left_out + lost:
+        warnings.warn(f"from_newton: left out: {', '.join(left_out + lost)}", UserWarning, stacklevel=3)
+    return scene if pairs is None else pairs.added_to(scene)
 
 
 class ModelPairs:
     """Pairs of a model's shapes that touch each other, in every world the same.
 
     Args:
-        model, worlds: The Newton model and its rows.
-        scene: Of the model.
-        asked: As the argument ``pairs`` of SolverSPO.
+        shapes: Of the model.
+        pairs: Of these shapes, one or more.
+        selection: That chose them.
 
     Attributes:
         rows: Indices of the first and of the second shape of each pair [2, world, pair].
         still: Those of shapes that stand still, of the first world or outside of all worlds.
-
-    Raises:
-        TypeError, ValueError, UnsupportedError: As :meth:`PairSelection.resolve`; or the worlds have different shapes.
     """
 
-    def __init__(self, model: newton.Model, worlds: WorldRows, scene: Scene, asked: Any):
-        self._shapes = ModelShapes(model, worlds)
-        selection = _select_pairs(self._shapes, scene)
-        pairs, left_out = selection.resolve(asked)
-        if left_out:
-            more = f" and {len(left_out) - 4} more" if len(left_out) > 4 else ""
-            warnings.warn(
-                f"SolverSPO: pairs='all' leaves out {', '.join(left_out[:4])}{more}, which no contact represents",
-                UserWarning,
-                stacklevel=5,
-            )
+    def __init__(self, shapes: ModelShapes, pairs: list[ShapePair], selection: PairSelection):
+        self._shapes = shapes
         self.still = frozenset(pair.second.index for pair in pairs if not selection.moves(pair.second))
         self._contacts = [pair.contact() for pair in pairs]
         self.rows = np.array([[self._shapes.rows_of(pair[side]) for pair in pairs] for side in range(2)])
         self.rows = np.ascontiguousarray(self.rows.transpose(0, 2, 1))
-        self.count, device = len(pairs), model.device
+        self.count, device = len(pairs), shapes.model.device
         self._sides: list[Any] = [wp.array(rows, dtype=wp.int32, device=device) for rows in self.rows]
         declare(kernels, None)
 

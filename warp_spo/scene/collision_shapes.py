@@ -24,11 +24,14 @@ from .ground import HeightField, Plane
 
 if TYPE_CHECKING:
     from .scene import Scene
+    from .shape_pairs import PairSelection, ShapePair
 
 POINTS = 8
 """Points of a shape that is the hull of points, if the caller does not say."""
 GROUND = "ground"
 """The choice of the shapes of all bodies that can move, for contacts with the ground alone."""
+ALL = "all"
+"""The choice of all pairs of bodies that a source lets touch each other."""
 UPRIGHT = 0.5  # least cosine between the normal of a ground and the upward direction
 STEEP = ", steeper than 60 degrees"  # what a ground is that is not UPRIGHT
 AXIS_TOLERANCE = 1e-6  # by which axes of a height field may differ from the inertial ones
@@ -128,7 +131,7 @@ class SelectedContacts(NamedTuple):
 
 
 class ShapeSelection(NamedTuple):
-    """Choice of the shapes of a source that touch the ground, as :func:`warp_spo.load` takes it.
+    """Choice of the shapes of a source that touch the ground or each other, as :func:`warp_spo.load` takes it.
 
     Attributes:
         contacts: None: none. "ground" or True: those of all bodies that can move. A pattern, several, or points by
@@ -136,11 +139,13 @@ class ShapeSelection(NamedTuple):
         ground: None: that of the source, or the plane at height zero; for all bodies a source that is ``complete`` has
             no ground but its own.
         points: of a hull at most.
+        pairs: of bodies that touch each other: "all", a list of names, or None, which is none and a word about it.
     """
 
     contacts: Any = None
     ground: Any = None
     points: Any = POINTS
+    pairs: Any = None
 
     def apply(
         self,
@@ -150,26 +155,35 @@ class ShapeSelection(NamedTuple):
         touches: CollisionFilter | None = None,
         material_rule: MaterialRule = CollisionShape.with_mean_material,
         complete: bool = False,
+        pairs: Callable[[], PairSelection] | None = None,
     ) -> tuple[Scene, list[str]]:
         """Return the scene with contacts for the chosen shapes, and in words what is left out, such as "box 'table'".
+
+        Shapes that stand still and are in a chosen pair are not left out.
 
         Args:
             call: for errors. shapes: returns those of the source; called only if some are wanted.
             touches: says whether a shape collides with the ground of the source; None: each of ``shapes`` does.
             material_rule: returns a shape with its material on the ground of the source; None: another ground.
             complete: the source describes a whole world, as a MuJoCo or a Newton model does, not a robot alone.
+            pairs: returns what chooses the pairs of bodies; called only if some are wanted, or may be missed.
 
         Raises:
             ValueError: a pattern matches no shape of a body that can move, a number of points is invalid, or there is a
                 ground without contacts.
             UnsupportedError: a pattern matches a shape that no contact represents; or several grounds.
         """
-        if not self.wants(call):
-            return scene, []
         try:
-            found = self.resolve(call, scene, shapes(), touches, material_rule, complete)
-            contacts = [one for _, made in found.contacts_by_shape for one in made]
-            return scene.with_contacts(contacts, found.ground), found.left_out
+            touching, left_out = self.body_pairs(pairs)
+            contacts, ground, grounded = [pair.contact() for pair in touching], None, self.wants(call)
+            if grounded:
+                paired = {pair.second.index for pair in touching}
+                moving = moving_bodies(scene)
+                seen = [one for one in shapes() if one.index not in paired or (one.body >= 0 and moving[one.body])]
+                found = self.resolve(call, scene, seen, touches, material_rule, complete)
+                contacts = [one for _, made in found.contacts_by_shape for one in made] + contacts
+                ground, left_out = found.ground, found.left_out + left_out
+            return scene.with_contacts(contacts, ground) if grounded or contacts else scene, left_out
         except (ValueError, TypeError) as error:  # of a contact, which knows neither the call nor the file
             if not str(error).startswith(call):
                 error.args = (f"{call}: {error}",)
@@ -178,16 +192,36 @@ class ShapeSelection(NamedTuple):
     @property
     def takes_all(self) -> bool:
         """Whether it takes the shapes of all bodies that can move, not those of patterns."""
-        return self.contacts is True or (isinstance(self.contacts, str) and self.contacts == GROUND)
+        return self.contacts is True or self._is_ground
+
+    @property
+    def _is_ground(self) -> bool:
+        return isinstance(self.contacts, str) and self.contacts == GROUND
+
+    @property
+    def _takes_all_pairs(self) -> bool:
+        return isinstance(self.pairs, str) and self.pairs == ALL
 
     def unless(self, disabled: bool) -> tuple[ShapeSelection, list[str]]:
         """Return the selection for a source that may disable contacts, and in words what is left out.
 
-        Patterns do not obey it.
+        Patterns and lists of pairs do not obey it.
         """
-        if not disabled or not self.takes_all:
+        if not disabled:
             return self, []
-        return NONE, ["all contacts, which its options disable (a pattern, such as contacts='*', takes them anyway)"]
+        kept = self._replace(contacts=None, ground=None) if self.takes_all else self
+        kept = kept._replace(pairs=()) if self.pairs is None or self._takes_all_pairs else kept
+        if not (self.takes_all or self._takes_all_pairs):
+            return kept, []
+        return kept, ["all contacts, which its options disable (a pattern, such as contacts='*', takes them anyway)"]
+
+    def body_pairs(self, pairs: Callable[[], PairSelection] | None) -> tuple[list[ShapePair], list[str]]:
+        """Return the pairs of bodies that touch each other, and in words those that are left out."""
+        unasked = self.pairs is None and (self.contacts is None or self._is_ground)
+        if pairs is None or unasked or (isinstance(self.pairs, list | tuple) and not self.pairs):
+            return [], []
+        selection = pairs()
+        return ([], selection.missed()) if self.pairs is None else selection.chosen(self.pairs)
 
     def wants(self, call: str) -> bool:
         """Return whether contacts are wanted; ValueError for a ground without any, errors of patterns and points."""

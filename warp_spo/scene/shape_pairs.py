@@ -8,14 +8,13 @@ from itertools import combinations, product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import UnsupportedError, as_integer
-from .collision_shapes import CollisionShape
+from .collision_shapes import ALL, GROUNDS, CollisionShape
 from .contact_shapes import SHAPES, ContactShape
-from .contacts import Contact
+from .contacts import FRICTIONS, Contact
 
 if TYPE_CHECKING:
     from .scene import Scene
 
-ALL = "all"
 MOST = 32
 """Pairs at most that "all" stands for: what compiles in seconds. Nine boxes, 36 pairs, took 11 s on a CPU."""
 KINDS = tuple(kind for kind, shape in SHAPES.items() if shape.names and shape.pairs)
@@ -31,10 +30,20 @@ HULL_WAYS = (
 
 
 class ShapePair(NamedTuple):
-    """Two shapes of two bodies; reported forces are those on the first, which moves."""
+    """Two shapes of two bodies; reported forces are those on the first, which moves.
+
+    The material of the pair is the mean of both, or that of the one that has one.
+    """
 
     first: CollisionShape
     second: CollisionShape
+
+    @property
+    def unread(self) -> str:
+        """What of the pair's material a contact of two bodies does not take, in words; "" if there is nothing."""
+        own = self.first.with_mean_material(self.second)
+        turning = [name.replace("_", " ") for name in FRICTIONS[1:] if getattr(own, name)]
+        return ", ".join([*turning, *([own.unread] if own.unread else [])])
 
     @property
     def fits(self) -> bool:
@@ -46,8 +55,9 @@ class ShapePair(NamedTuple):
         a, b = self.first.with_mean_material(self.second), self.second
         solids = [_with_margins(one, other).arguments() for one, other in ((a, b), (b, a))]
         material = {name: getattr(a, name) for name in ("stiffness", "damping")}
-        if a.friction is not None:
-            material["friction"] = a.friction
+        friction = b.friction if a.friction is None else a.friction
+        if friction is not None:
+            material["friction"] = friction
         label = f"{a.label} with {b.label}" if a.label and b.label else ""
         return Contact(a.body, **solids[0], other=Contact(b.body, **solids[1]), **material, label=label)
 
@@ -73,6 +83,8 @@ class PairSelection:
         shapes: of the source, in the order of its numbers.
         allowed: says whether the source lets two shapes collide.
         numbers: the shape of each number that a user may give.
+        as_pair: returns two shapes with the material that the source gives to their contact.
+        takes_still: whether "all" has shapes that stand still, too, but for grounds.
     """
 
     call: str
@@ -80,11 +92,17 @@ class PairSelection:
     shapes: Sequence[CollisionShape]
     allowed: Callable[[CollisionShape, CollisionShape], bool]
     numbers: dict[int, CollisionShape]
+    as_pair: Callable[[CollisionShape, CollisionShape], ShapePair] = ShapePair
+    takes_still: bool = False
+    _pieces: list[int] = dataclasses.field(init=False)
     _lacking: dict[int, str] = dataclasses.field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_pieces", rigid_pieces(self.scene)[0])
 
     def moves(self, shape: CollisionShape) -> bool:
         """Whether a shape moves; that of a body that is fixed to the inertial frame does not."""
-        return self._carrier(shape.body) >= 0
+        return self._piece(shape) >= 0
 
     def resolve(self, asked: Any) -> tuple[list[ShapePair], list[str]]:
         """Return the pairs that ``asked`` stands for, and in words those of "all" that no contact represents.
@@ -98,7 +116,7 @@ class PairSelection:
             UnsupportedError: No contact represents a listed pair, or "all" are too many.
         """
         if isinstance(asked, str) and asked == ALL:
-            return self._all_pairs([shape for shape in self.shapes if self.moves(shape)])
+            return self._all_pairs()
         if isinstance(asked, str) or not isinstance(asked, Sequence) or not all(map(_is_pair, asked)):
             raise TypeError(
                 f"{self.call}: pairs is {asked!r}; expected 'all', or a list of pairs of names of shapes or bodies, "
@@ -121,9 +139,45 @@ class PairSelection:
         sides = (pair for one, other in combinations(trees.values(), 2) for pair in product(one, other))
         return next((ShapePair(*pair) for pair in sides if self.allowed(*pair)), None)
 
-    def _all_pairs(self, solid: Sequence[CollisionShape]) -> tuple[list[ShapePair], list[str]]:
+    def missed(self) -> list[str]:
+        """Return in words that the scene has no contacts of bodies which may touch each other; nothing without any."""
+        pairs = self._touching()
+        if not pairs:
+            return []
+        way = "pairs='all' takes them" if len(pairs) <= MOST else f"pairs=[...] takes up to {MOST} by names"
+        such = ShapePair(*sorted(pairs[0], key=self.moves, reverse=True)).words(self.scene.body_labels)
+        ways = f"{way}; contacts='ground' or pairs=[] says that there are none"
+        return [f"contacts between bodies: {len(pairs)} pair(s) of shapes, such as {such} ({ways})"]
+
+    def chosen(self, asked: Any) -> tuple[list[ShapePair], list[str]]:
+        """Return the pairs that ``asked`` stands for, and in words what is left out; errors as :meth:`resolve`."""
+        pairs, lost = self.resolve(asked)
+        words = [f"contacts of {len(lost)} pair(s) of shapes, such as {lost[0]} ({WAYS})"] if lost else []
+        for unread in dict.fromkeys(pair.unread for pair in pairs if pair.unread):
+            names = [pair.words(self.scene.body_labels) for pair in pairs if pair.unread == unread]
+            words.append(f"{unread} of {len(names)} pair(s) of shapes, such as {names[0]}")
+        return pairs, words
+
+    def candidates(self) -> list[ShapePair]:
+        """Return every pair of shapes that may touch: of two rigid pieces, one of which moves, as the source says.
+
+        What stands still is in one only if ``takes_still`` says so, and no ground is. Pairs that overlap in the neutral
+        pose are among them, and those that joint limits keep apart.
+        """
+        return [self._ordered(*pair) for pair in self._touching()]
+
+    def _touching(self) -> list[tuple[CollisionShape, CollisionShape]]:
+        """Return the shapes of every pair that may touch."""
+        solid = [one for one in self.shapes if self.moves(one) or (self.takes_still and one.kind not in GROUNDS)]
+        return [pair for pair in combinations(solid, 2) if self._may_touch(*pair)]
+
+    def _ordered(self, a: CollisionShape, b: CollisionShape) -> ShapePair:
+        """Return the pair of two shapes, that which moves first."""
+        return self.as_pair(a, b) if self.moves(a) else self.as_pair(b, a)
+
+    def _all_pairs(self) -> tuple[list[ShapePair], list[str]]:
         """Return every pair that may touch, and in words those that no contact represents."""
-        pairs = [ShapePair(*pair) for pair in combinations(solid, 2) if self._may_touch(*pair)]
+        pairs = self.candidates()
         found = [pair for pair in pairs if self._stands(pair)]
         if not found:
             left_out = f"; {pairs[0].words(self.scene.body_labels)} is none that it can take" if pairs else ""
@@ -142,7 +196,7 @@ class PairSelection:
     def _named_pairs(self, names: Sequence[Any]) -> list[ShapePair]:
         """Return the pairs that two names stand for."""
         sides = [self._shapes_of_name(name) for name in names]
-        both = [ShapePair(a, b) if self.moves(a) else ShapePair(b, a) for a, b in product(*sides) if a.index != b.index]
+        both = [self._ordered(a, b) for a, b in product(*sides) if a.index != b.index]
         pairs = [pair for pair in both if self._may_touch(*pair)]
         bodies, what = self.scene.body_labels, f"pairs={tuple(names)!r}"
         if not pairs:
@@ -184,14 +238,24 @@ class PairSelection:
 
     def _may_touch(self, a: CollisionShape, b: CollisionShape) -> bool:
         """Whether two shapes can move against each other, and the source lets them collide."""
-        return self._carrier(a.body) != self._carrier(b.body) and self.allowed(a, b)
+        return self._piece(a) != self._piece(b) and self.allowed(a, b)
 
-    def _carrier(self, body: int) -> int:
-        """Return the body nearest to the root to which a body is fixed; -1: it stands still."""
-        scene = self.scene
-        while body >= 0 and scene.hinges[scene.hinge_of[body]].dof_count == 0:
-            body = scene.tree.parent[body]
-        return body
+    def _piece(self, shape: CollisionShape) -> int:
+        return self._pieces[shape.body] if shape.body >= 0 else -1
+
+
+def rigid_pieces(scene: Scene) -> tuple[list[int], list[int]]:
+    """Return the rigid piece of each body, and the piece that carries it.
+
+    A piece is all that fixed hinges connect, and has the index of its body nearest to the root; -1: it stands still.
+    """
+    piece, above = [-1] * len(scene.bodies), [-1] * len(scene.bodies)
+    for body in (body for level in scene.tree.levels for body in level):
+        parent = int(scene.tree.parent[body])
+        own = scene.hinges[scene.hinge_of[body]].dof_count > 0
+        carrier, higher = (piece[parent], above[parent]) if parent >= 0 else (-1, -1)
+        piece[body], above[body] = (body, carrier) if own else (carrier, higher)
+    return piece, above
 
 
 def _is_pair(names: Any) -> bool:

@@ -53,6 +53,7 @@ def load(
     contacts: bool | str | Sequence[str] | Mapping[str, int] | None = None,
     ground: Plane | HeightField | None = None,
     points: int = POINTS,
+    pairs: str | Sequence[Sequence[str | int]] | None = None,
 ) -> Scene:
     """Return the scene of a robot file: URDF (.urdf), MJCF (.xml, .mjcf) or USD (.usd, .usda, .usdc, .usdz).
 
@@ -84,6 +85,13 @@ def load(
         ground: The ground that they touch. None: the file's plane or height field; without one, the plane at height
             zero, but no contacts for contacts="ground" of an MJCF file, which a warning says.
         points: Of a shape that is the hull of points, at most.
+        pairs: Which shapes of two bodies touch each other: "all" that the file lets touch, at most 32 pairs, those with
+            shapes that stand still, such as a table, included; or a list of pairs of names, patterns of shapes or
+            bodies, such as ``[("cube", "*finger*")]``; None or [], none. None with ``contacts`` other than "ground"
+            warns of how many are left out. An MJCF file lets geoms touch by MuJoCo's rules: masks, ``<pair>``,
+            ``<exclude>``, not those of a body and its parent; a URDF all but links next to each other, where links that
+            fixed joints connect are one; a USD file by its filters and collision groups. Each is one contact with
+            ``other``, see :class:`Contact`; boxes, spheres, capsules and convex meshes of up to 64 corners can touch.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -115,7 +123,7 @@ def load(
     else:
         read = {"urdf": read_urdf, "usd": read_usd}[importer]
     try:
-        return read(file, floating, repair, ShapeSelection(contacts, ground, points))
+        return read(file, floating, repair, ShapeSelection(contacts, ground, points, pairs))
     except ParseError as error:
         raise not_xml(file, error, importer) from None
     except ImportError as error:

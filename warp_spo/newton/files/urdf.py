@@ -8,6 +8,7 @@ without <inertial> has no mass, a "continuous" joint has no limits, and a "plana
 
 from __future__ import annotations
 
+import functools
 import warnings
 from collections.abc import Callable, Container
 from pathlib import Path
@@ -23,7 +24,7 @@ from ..worlds import quote_labels
 from .inertia_repair import repair_bodies
 from .urdf_masses import mass_of_shapes
 from .urdf_mimics import SCALAR, read_mimics
-from .urdf_shapes import urdf_shapes
+from .urdf_shapes import urdf_pairs, urdf_shapes
 from .xml_source import XmlElement, read_xml
 
 KINDS = {
@@ -90,7 +91,8 @@ def read_urdf(file: Path, floating: bool | None, repair: bool, selection: ShapeS
         raise ValueError(f"load: {str(file)!r}: {error}") from error
     ordered = [links[link] for link in number]
     call = f"load: {str(file)!r}"
-    scene, lost = selection.apply(call, scene, lambda: urdf_shapes(robot, ordered, list(map(label, number)), _origin))
+    shapes = functools.cache(lambda: urdf_shapes(robot, ordered, list(map(label, number)), _origin))
+    scene, lost = selection.apply(call, scene, shapes, pairs=lambda: urdf_pairs(call, scene, shapes()))
     if lost:
         warnings.warn(f"{call}: left out: {', '.join(lost)}", UserWarning, stacklevel=3)
     return scene

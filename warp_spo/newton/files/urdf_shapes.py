@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,8 @@ import numpy as np
 from ...errors import quoted, shown
 from ...scene.collision_shapes import CollisionShape
 from ...scene.contact_shapes import SHAPES, kinds_in
+from ...scene.scene import Scene
+from ...scene.shape_pairs import PairSelection, rigid_pieces
 from .urdf_masses import mesh_file, unit_of
 from .xml_source import XmlElement
 
@@ -50,7 +53,20 @@ def urdf_shapes(
                     found.append(CollisionShape(name, body, kind, pose, sizes, names=names, **frictions))
                 else:
                     found.append(CollisionShape(name, body, f"<{shape.tag}>", pose))
-    return found
+    return [dataclasses.replace(shape, index=index) for index, shape in enumerate(found)]
+
+
+def urdf_pairs(call: str, scene: Scene, shapes: list[CollisionShape]) -> PairSelection:
+    """Return what chooses pairs of the shapes of a URDF: all of two links that a joint which moves does not connect.
+
+    Links that fixed joints connect are one, and so are all that stand still.
+    """
+    piece, above = rigid_pieces(scene)
+
+    def apart(one: CollisionShape, other: CollisionShape) -> bool:
+        return above[one.body] != piece[other.body] and above[other.body] != piece[one.body]
+
+    return PairSelection(call, scene, shapes, apart, dict(enumerate(shapes)), takes_still=True)
 
 
 def _urdf_sizes(shape: Any) -> tuple[str, Any, tuple[str, ...]]:

@@ -16,8 +16,10 @@ from ...errors import UnsupportedError, shown
 from ...scene.collision_shapes import NONE, CollisionShape, ShapeSelection
 from ...scene.contacts import Contact
 from ...scene.scene import Scene
+from ...scene.shape_pairs import PairSelection
 from ..model import from_newton
 from ..model_contacts import ModelShapes
+from ..pairs import select_pairs
 from ..worlds import WorldRows, quote_labels
 from .inertia_repair import repair_bodies
 from .usd_attributes import left_out
@@ -261,7 +263,12 @@ def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool, selection: 
     def touches(shape: CollisionShape, ground: CollisionShape) -> bool:
         return shapes().touches(shape, ground)
 
-    scene, lost = selection.apply(call, scene, lambda: shapes().first(), touches, CollisionShape.with_mean_material)
+    def pairs() -> PairSelection:
+        return select_pairs(call, shapes(), scene, takes_still=True)
+
+    scene, lost = selection.apply(
+        call, scene, lambda: shapes().first(), touches, CollisionShape.with_mean_material, pairs=pairs
+    )
     if lost:
         warnings.warn(f"{call}: left out: {', '.join(lost)}", UserWarning, stacklevel=4)
     return scene
