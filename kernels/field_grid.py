@@ -442,19 +442,33 @@ struct grid_search
         }
     };
 
+    // The corners of a cell, which beyond an edge is level across it; ``last``: the numbers of the field's last cell.
+    static CUDA_CALLABLE inline void levelled(const REAL* cells, const int* each, const int* last, REAL* h)
+    {
+        int in[2];
+        for (int f = 0; f < 2; ++f) in[f] = each[f] > 0 ? (each[f] < last[f] ? each[f] : last[f]) : 0;
+        const REAL* at = cells + 4ll * (in[0] * (last[1] + 2) + in[1]);
+        for (int n = 0; n < 4; ++n) {
+            const int i = each[0] == in[0] ? n / 2 : each[0] > in[0];
+            const int j = each[1] == in[1] ? n % 2 : each[1] > in[1];
+            h[n] = at[2 * i + j];
+        }
+    }
+
     // Asked are the first height, the centre from there, the cell, points along x and y, how many cells to each side
     // are tried, and whether for a second one; found are the nearest cell, the second, and whether that is there.
     static CUDA_CALLABLE inline void sphere(const REAL* table, const REAL* asked, REAL* out)
     {
         const REAL *cells = table + 4ll * (int)asked[0], *size = asked + 4;
-        REAL at[2];
+        const int ring = (int)asked[8];
+        REAL at[2], corners[4];
         int middle[2], last[2];
         for (int f = 0; f < 2; ++f) {
             last[f] = (int)asked[6 + f] - 2;
-            at[f] = Foot::inside(asked[1 + f] * (1 / size[f]), asked[6 + f] - 1);
-            middle[f] = (int)(at[f] + (REAL)0.5);
+            const REAL x = asked[1 + f] * (1 / size[f]), most = asked[6 + f] - 1 + ring;
+            at[f] = x > -ring ? (x < most ? x : most) : -ring;
+            middle[f] = (int)(at[f] + ring + (REAL)0.5) - ring;
         }
-        const int ring = (int)asked[8];
         REAL first[3] = {0, 0, 0}, square = 0;
         out[2] = out[3] = 0;
         LOOP
@@ -463,9 +477,8 @@ struct grid_search
             int best[2] = {0, 0};
             LOOP
             for (int n = 0; n < 4 * ring * ring; ++n) {
-                int each[2] = {middle[0] - ring + n / (2 * ring), middle[1] - ring + n % (2 * ring)};
-                for (int f = 0; f < 2; ++f) each[f] = each[f] > 0 ? (each[f] < last[f] ? each[f] : last[f]) : 0;
-                const REAL* corners = cells + 4ll * (each[0] * (last[1] + 2) + each[1]);
+                const int each[2] = {middle[0] - ring + n / (2 * ring), middle[1] - ring + n % (2 * ring)};
+                levelled(cells, each, last, corners);
                 const Foot foot(
                     corners, size, (at[0] - each[0]) * size[0], (at[1] - each[1]) * size[1], asked[3], STEPS);
                 if (round) {
@@ -479,7 +492,7 @@ struct grid_search
                 if (!(least < FAR)) out[4] = 0;
                 continue;
             }
-            const REAL* corners = cells + 4ll * (best[0] * (last[1] + 2) + best[1]);
+            levelled(cells, best, last, corners);
             const Foot foot(
                 corners, size, (at[0] - best[0]) * size[0], (at[1] - best[1]) * size[1], asked[3], STEPS + 1);
             for (int x = 0; x < 3; ++x) first[x] = foot.away[x];

@@ -8,6 +8,7 @@ from benchmarks.contact import shapes
 from support import contact_gradients
 from support.contact_cases import box
 from support.contact_steps import FIELDS, H, above, assert_is_dense
+from warp_spo.reference.contact import ContactStep
 from warp_spo.reference.field_spheres import nearest_points
 
 
@@ -73,3 +74,51 @@ def test_a_ball_in_a_groove_rests_on_both_sides():
     sink = 0.04 / np.cos(np.radians(40.0)) - states[-1, 2]
     assert abs(sink / (9.81 / (2e4 * np.cos(np.radians(40.0)) ** 2)) - 1.0) < 1e-2
     assert abs(states[-1, 0]) < 1e-4 and np.abs(states[-1, 7:]).max() < 1e-3
+
+
+OUTSIDE = {
+    "sphere": dict(sphere=((0, 0, 0), 0.05)),
+    "large sphere": dict(sphere=((0, 0, 0), 0.09)),
+    "cylinder": dict(cylinder=((0, -0.05, 0), (0, 0.05, 0), 0.05)),
+    "ellipsoid": dict(ellipsoid=(0.05, 0.05, 0.05)),
+    "box": dict(box=(0.05, 0.05, 0.05)),
+}
+
+
+@pytest.mark.parametrize("kind", OUTSIDE)
+def test_beyond_the_edge_a_field_is_level_across_it(kind):
+    """Of a slope of 20 degrees along x: no force along x beyond both ends, and the whole slope's beside it."""
+    slope, size = np.tan(np.radians(20.0)), 0.09 if kind == "large sphere" else 0.05
+    field = spo.HeightField(np.repeat(slope * (np.arange(21) - 10.0)[:, None] * 0.1, 21, 1), 0.1, (-1.0, -1.0))
+    scene = box().with_contacts([spo.Contact(0, **OUTSIDE[kind])], field)
+    places = np.array([[-3.0, 0.0], [3.0, 0.013], [-1.2, 0.0], [3.0, 5.0], [0.013, 2.0]])
+    q = np.array([[x, y, slope * np.clip(x, -1, 1) + size - 1e-3, 0, 0, 0, 1.0] for x, y in places])
+    q[4, 2] += size * (1.0 / np.cos(np.radians(20.0)) - 1.0) - 1e-3
+    a = {"q": q, "qd": np.zeros((5, 6))}
+    assert_is_dense(scene, a, 3)
+    for one in q:
+        points = ContactStep(scene, one, np.zeros(6), H).points
+        normals = points.n[points.depth > 0.0]
+        assert len(normals)
+        wanted = np.array([-slope if one[1] == 2.0 else 0.0, 0.0, 1.0])
+        np.testing.assert_allclose(normals, np.tile(wanted / np.linalg.norm(wanted), (len(normals), 1)), atol=1e-9)
+        if one[1] != 2.0:
+            assert abs(points.depth.max() - 1e-3) < 1e-9
+
+
+@pytest.mark.parametrize("radius", [0.05, 0.09])
+def test_a_sphere_before_the_edge_of_a_field_touches_its_slope(radius):
+    """The nearest point is on the slope inside: its depth is r - (z cos t - x sin t); in the kernel, too."""
+    slope, angle = np.tan(np.radians(20.0)), np.radians(20.0)
+    field = spo.HeightField(np.repeat(slope * np.arange(9)[:, None] * 0.1, 9, 1), 0.1, (0.0, -0.4))
+    scene = box().with_contacts([spo.Contact(0, sphere=((0, 0, 0), radius))], field)
+    x = np.array([-0.005, -0.35, 0.0])
+    q = np.array([[at, 0.013, radius - 2e-4, 0.0, 0.0, 0.0, 1.0] for at in x])
+    depths = [radius - ((radius - 2e-4) * np.cos(angle) - at * np.sin(angle)) for at in x]
+    depths[1] = 2e-4
+    found = [ContactStep(scene, one, np.zeros(6), H).points.depth.max() for one in q]
+    np.testing.assert_allclose(found[:2], depths[:2], atol=1e-9)
+    dyn = spo.Dynamics(scene, worlds=3, dtype="float64", device="cpu")
+    report = dyn.step_report("contact_gap", like=q)
+    dyn.step(q, np.zeros((3, 6)), dt=H, report=report)
+    np.testing.assert_allclose(-report.contact_gap[:, 0], found, atol=1e-12)

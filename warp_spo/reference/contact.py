@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .dense import Dense
+from .field_cells import cell_at, cell_corners
 from .field_grid import find, touched
 from .field_spheres import nearest_points
 from .rotations import homogeneous
@@ -230,18 +231,18 @@ def surfaces(field, at, number=0, moves=(0.0, 0.0, 0.0), walls=True):
     """Return normal and depth of the surfaces of a height field near a point that the step takes by ``moves``.
 
     They are the field's own, or a floor and a wall where the middle slope of the cell exceeds 1. The wall ends at the
-    highest corner. A cell without a wall is followed by the wall of the cell where the step takes the point, if that
+    highest corner. Beyond an edge the field is level across it. A cell without a wall is followed by the wall of the cell where the step takes the point, if that
     rises along ``moves``. Of a set of fields it is that of this number. Without ``walls`` they are the field's own.
     """
     h, place = field.heights.reshape(-1, *field.heights.shape[-2:])[number], at[:2] - field.origin[:2]
-    place, ahead = (np.clip(x / field.cell, 0.0, np.array(h.shape) - 1.0) for x in (place, place + moves[:2]))
+    place, ahead = place / field.cell, (place + moves[:2]) / field.cell
     z = at[2] - field.origin[2]
     upward = lambda slope: np.array([*-slope, 1.0]) / np.sqrt(1.0 + slope @ slope)  # noqa: E731
 
     def cell(inside):
         """The corners of the cell, its slope in the middle, and where ``place`` is in it."""
-        first = np.minimum(inside.astype(int), np.array(h.shape) - 2)
-        corners = h[first[0] : first[0] + 2, first[1] : first[1] + 2]
+        first = cell_at(inside, h.shape)
+        corners = cell_corners(h, first)
         middle = np.array([corners[1] - corners[0], corners[:, 1] - corners[:, 0]]).mean(axis=1) / field.cell
         return corners, middle, place - first
 

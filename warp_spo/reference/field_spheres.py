@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from .field_cells import cell_corners
+
 STEPS, REACH, APART = 2, 0.71, 0.94  # steps in a cell; sine of 45 degrees; cosine of 20 degrees
 
 
@@ -16,9 +18,9 @@ def nearest_points(field, centre, radius, number=0, both=True):
     start = centre - np.array(field.origin)
     ring = 1 if REACH * radius <= 0.5 * cell.min() else 2
     *cells, there = find_cells(h, start, cell, ring, both)
-    at = np.clip(start[:2] / cell, 0.0, np.array(h.shape) - 1.0)
+    at = np.clip(start[:2] / cell, -ring, np.array(h.shape) - 1.0 + ring)
     chosen = [np.array(cells[:2], dtype=int), np.array(cells[2:], dtype=int)][: 2 if both and there else 1]
-    surfaces = [_foot(h[i : i + 2, j : j + 2], (at - (i, j)) * cell, start[2], cell, STEPS + 1) for i, j in chosen]
+    surfaces = [_foot(cell_corners(h, (i, j)), (at - (i, j)) * cell, start[2], cell, STEPS + 1) for i, j in chosen]
     above = surfaces[0][1]
     signed = [(up if above else -up, np.linalg.norm(up) if above else -np.linalg.norm(up)) for up, _ in surfaces]
     return [(up / abs(distance), radius - distance) for up, distance in signed]
@@ -29,15 +31,16 @@ def find_cells(heights, centre, cell, ring, both):
 
     Args:
         heights: of one field [i, j]. centre: from its first point [m]. ring: how many cells to each side are tried.
+
+    Cells beyond the edges count, with numbers below zero or above those of the field's last ones.
     """
     most = np.array(heights.shape) - 1
-    at = np.clip(centre[:2] / cell, 0.0, most) if np.isfinite(centre).all() else np.zeros(2)
+    at = np.clip(centre[:2] / cell, -ring, most + ring) if np.isfinite(centre).all() else np.zeros(2)
     found = []
     for i in range(-ring, ring):
         for j in range(-ring, ring):
-            first = np.clip(np.floor(at + 0.5) + np.array((i, j)), 0, most - 1).astype(int)
-            corners = heights[first[0] : first[0] + 2, first[1] : first[1] + 2]
-            found.append((first, corners, (at - first) * cell))
+            first = (np.floor(at + 0.5) + np.array((i, j))).astype(int)
+            found.append((first, cell_corners(heights, first), (at - first) * cell))
     feet = [_foot(*each[1:], centre[2], cell, STEPS) for each in found]
     best = int(np.argmin([away @ away for away, _ in feet]))
     away, above = _foot(*found[best][1:], centre[2], cell, STEPS + 1)
