@@ -9,14 +9,26 @@ import math
 
 import warp as wp
 
+from . import hull_corners
 from .elementary import C_TYPE
 
 NAME = "grid_search"
 RULES = {
     "OUTWARD": 1e-3, "TIE": 1e-6, "DOWN": 0.5, "ACROSS": 0.17, "BESIDE": 0.35, "SLACK": 0.5, "PARALLEL": 1e-6,
     "FAR": 1e30, "APART": 0.94 * 0.94, "ABOVE": 0.5, "STANDS": 0.7, "PI": math.pi,
+    "LEAN": math.tan(hull_corners.LEAN),
 }  # fmt: skip
-KINDS = {"QUADRANTS": 4, "SIDE": 3, "RIM": 32, "POINT": 1, "LINE_Y": 2, "LINE_X": 3, "ROW": 9, "STEPS": 2}
+KINDS = {
+    "QUADRANTS": 4,
+    "SIDE": 3,
+    "RIM": 32,
+    "POINT": 1,
+    "LINE_Y": 2,
+    "LINE_X": 3,
+    "ROW": 9,
+    "STEPS": 2,
+    "CHOSEN": hull_corners.ROWS,
+}
 
 
 def definitions(code: str, T: type) -> list[str]:
@@ -498,6 +510,61 @@ struct grid_search
             for (int x = 0; x < 3; ++x) first[x] = foot.away[x];
             square = foot.square, out[4] = foot.outside;
         }
+    }
+
+    // The hull's own ``count`` numbers are its corners; place and presence of those that touch, see hull_corners.
+    static CUDA_CALLABLE inline void corners(
+        const REAL* table, const REAL* asked, const REAL* of, int count, REAL* out)
+    {
+        const Field field(table, asked);
+        REAL reach[CHOSEN], lean[CHOSEN][2];
+        int best[CHOSEN];
+        for (int row = 0; row < CHOSEN; ++row) {
+            on::sincos(2 * PI / (CHOSEN - 1) * row, lean[row][1], lean[row][0]);
+            for (int f = 0; f < 2; ++f) lean[row][f] *= row ? LEAN : 0;
+            best[row] = 0, reach[row] = -FAR;
+        }
+        LOOP
+        for (int i = 0; i < count / 3; ++i) {
+            REAL w[3];
+            for (int x = 0; x < 3; ++x) {
+                w[x] = 0;
+                for (int k = 0; k < 3; ++k) w[x] += of[3 * i + k] * field.axes[3 * k + x];
+            }
+            const REAL ground = floor(field, field.centre[0] + w[0], field.centre[1] + w[1]);
+            const REAL depth = ground - (field.centre[2] + w[2]);
+            for (int row = 0; row < CHOSEN; ++row) {
+                const REAL far = depth + (lean[row][0] * w[0] + lean[row][1] * w[1]);
+                if (far > reach[row] + TIE) best[row] = i, reach[row] = far;
+            }
+        }
+        for (int row = 0; row < CHOSEN; ++row) {
+            for (int c = 0; c < 3; ++c) out[4 * row + c] = of[3 * best[row] + c];
+            out[4 * row + 3] = 1;
+            for (int before = 0; before < row; ++before)
+                if (best[before] == best[row]) out[4 * row + 3] = 0;
+        }
+    }
+
+    // The height of the field at a place, also beyond its edges; where its cell is steep that of the lowest corner.
+    static CUDA_CALLABLE inline REAL floor(const Field& field, REAL x, REAL y)
+    {
+        const REAL place[2] = {x / field.cell[0], y / field.cell[1]};
+        REAL part[2], h[4];
+        int each[2], last[2];
+        for (int f = 0; f < 2; ++f) {
+            part[f] = field.limited(place[f], f), last[f] = field.count[f] - 2;
+            each[f] = (int)part[f] < last[f] ? (int)part[f] : last[f];
+            part[f] -= each[f];
+            if (place[f] < 0) each[f] = -1;
+            if (place[f] > field.count[f] - 1) each[f] = last[f] + 1;
+        }
+        levelled(field.cells, each, last, h);
+        const REAL slope_x = (h[2] + h[3] - h[0] - h[1]) / (2 * field.cell[0]);
+        const REAL slope_y = (h[1] + h[3] - h[0] - h[2]) / (2 * field.cell[1]);
+        if (slope_x * slope_x + slope_y * slope_y > 1) return least(least(h[0], h[1]), least(h[2], h[3]));
+        const REAL low = h[0] + part[1] * (h[1] - h[0]), high = h[2] + part[1] * (h[3] - h[2]);
+        return low + part[0] * (high - low);
     }
 
     // The height of the field at a place.

@@ -1,11 +1,12 @@
 """Spheres on a height field: the nearest points of the surface to the centre, and the normals there.
 
 A sphere touches where the surface is nearest to its centre c, in the direction from there to c. The cells around the
-grid point nearest to c are tried, two along each axis, or four where the radius is large beside the cell; beyond an edge they are level across it. In each the
-nearest point of its bilinear surface is found by Gauss and Newton from the place next to c: with slopes g and the
-height's error w there, the move u of least |e - u|^2 + (w - g . u)^2, where e leads to c, kept inside of the cell. The
-nearest cell's point is found again, with a step more, so that its derivatives are those of that cell's heights alone.
-Which cell that is a search in native code says, as :mod:`warp_spo.reference.field_spheres` specifies.
+grid point nearest to c are tried, two along each axis, or four where the radius is large beside the cell; beyond an
+edge they are level across it. In each the nearest point of its bilinear surface is found by Gauss and Newton from the
+place next to c: with slopes g and the height's error w there, the move u of least |e - u|^2 + (w - g . u)^2, where e
+leads to c, kept inside of the cell. The nearest cell's point is found again, with a step more, so that its derivatives
+are those of that cell's heights alone. Which cell that is a search in native code says, see
+:mod:`warp_spo.reference.field_grid`.
 
 Where a field has walls or creases a sphere may touch a second point: the nearest one that lies in another direction.
 """
