@@ -122,3 +122,14 @@ def test_a_sphere_before_the_edge_of_a_field_touches_its_slope(radius):
     report = dyn.step_report("contact_gap", like=q)
     dyn.step(q, np.zeros((3, 6)), dt=H, report=report)
     np.testing.assert_allclose(-report.contact_gap[:, 0], found, atol=1e-12)
+
+
+def test_spheres_too_large_for_the_cells_are_a_warning(recwarn):
+    """Of 0.22 m on cells of 0.1 m, where the slope's nearest point is 1.5 cells aside; not on a gentle slope."""
+    x = np.arange(9)[:, None] * np.ones((1, 9)) * 0.1
+    contact = [spo.Contact(0, sphere=((0, 0, 0), 0.22))]
+    box().with_contacts(contact, spo.HeightField(0.5 * x, 0.1))
+    box().with_contacts([spo.Contact(0, sphere=((0, 0, 0), 0.2))], spo.HeightField(x, 0.1))
+    assert not recwarn
+    with pytest.warns(UserWarning, match=r"1 sphere\(s\) are larger than 0.211 m, .*contact 0 of body .*: 0.22 m"):
+        box().with_contacts(contact, spo.HeightField(x, 0.1))
