@@ -16,7 +16,7 @@ NAME = "grid_search"
 RULES = {
     "OUTWARD": 1e-3, "TIE": 1e-6, "DOWN": 0.5, "ACROSS": 0.17, "BESIDE": 0.35, "SLACK": 0.5, "PARALLEL": 1e-6,
     "FAR": 1e30, "APART": 0.94 * 0.94, "ABOVE": 0.5, "STANDS": 0.7, "PI": math.pi,
-    "LEAN": math.tan(hull_corners.LEAN),
+    "LEAN": math.tan(hull_corners.LEAN), "NEARER": 1.0 - 1e-6,
 }  # fmt: skip
 KINDS = {
     "QUADRANTS": 4,
@@ -497,7 +497,7 @@ struct grid_search
                     const REAL turned = foot.away[0] * first[0] + foot.away[1] * first[1] + foot.away[2] * first[2];
                     if (!foot.outside || !(turned < 0 || turned * turned < APART * foot.square * square)) continue;
                 }
-                if (foot.square < least) least = foot.square, best[0] = each[0], best[1] = each[1];
+                if (foot.square < NEARER * least) least = foot.square, best[0] = each[0], best[1] = each[1];
             }
             out[2 * round] = best[0], out[2 * round + 1] = best[1];
             if (round) {

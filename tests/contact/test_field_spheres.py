@@ -8,8 +8,9 @@ from benchmarks.contact import shapes
 from support import contact_gradients
 from support.contact_cases import box
 from support.contact_steps import FIELDS, H, above, assert_is_dense
+from warp_spo.reference import field_spheres
 from warp_spo.reference.contact import ContactStep
-from warp_spo.reference.field_spheres import nearest_points
+from warp_spo.reference.field_spheres import find_cells, nearest_points
 
 
 @pytest.mark.parametrize("name", shapes.fields())
@@ -52,6 +53,24 @@ def test_gradients_are_differences(name):
     for argument, (error, crossed) in errors.items():
         assert error <= 1e-8, (argument, errors)  # 6e-10 measured
         assert crossed <= 1 / 3, (argument, errors)  # one of three states is where the nearest cell changes
+
+
+def test_rounding_does_not_choose_the_cell(monkeypatch):
+    """On a ridge two cells share the nearest point: the one that is found stays for any rounding."""
+    heights = np.zeros((5, 5))
+    heights[2] = 0.02
+    heights[2, 2] = 0.05
+    moves = 1e-13 * np.random.default_rng(0).normal(size=(30, 3))
+
+    def counts():
+        """How many answers each place has; the first lie beside the ridge along y, the last beside those along x."""
+        places = ((0.208, 0.124, 0.06), (0.196, 0.222, 0.06), (0.254, 0.2015, 0.06), (0.145, 0.2016, 0.06))
+        size = np.array([0.1, 0.1])
+        return [len({tuple(find_cells(heights, place + move, size, 1, True)) for move in moves}) for place in places]
+
+    assert counts() == [1, 1, 1, 1]
+    monkeypatch.setattr(field_spheres, "NEARER", 1.0)
+    assert max(counts()) > 1
 
 
 def test_a_tilted_field_is_a_tilted_plane():

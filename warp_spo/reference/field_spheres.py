@@ -5,6 +5,7 @@ import numpy as np
 from .field_cells import cell_corners
 
 STEPS, REACH, APART = 2, 0.71, 0.94  # steps in a cell; sine of 45 degrees; cosine of 20 degrees
+NEARER = 1.0 - 1e-6  # of a square of a distance: what is less far counts as nearer than an earlier cell
 
 
 def nearest_points(field, centre, radius, number=0, both=True):
@@ -32,7 +33,8 @@ def find_cells(heights, centre, cell, ring, both):
     Args:
         heights: of one field [i, j]. centre: from its first point [m]. ring: how many cells to each side are tried.
 
-    Cells beyond the edges count, with numbers below zero or above those of the field's last ones.
+    Cells beyond the edges count, with numbers below zero or above those of the field's last ones. Cells that share the
+    nearest point, on their edge, are equally far but for rounding: of those the first counts, see NEARER.
     """
     most = np.array(heights.shape) - 1
     at = np.clip(centre[:2] / cell, -ring, most + ring) if np.isfinite(centre).all() else np.zeros(2)
@@ -42,14 +44,23 @@ def find_cells(heights, centre, cell, ring, both):
             first = (np.floor(at + 0.5) + np.array((i, j))).astype(int)
             found.append((first, cell_corners(heights, first), (at - first) * cell))
     feet = [_foot(*each[1:], centre[2], cell, STEPS) for each in found]
-    best = int(np.argmin([away @ away for away, _ in feet]))
+    best = _first_nearest([away @ away for away, _ in feet])
     away, above = _foot(*found[best][1:], centre[2], cell, STEPS + 1)
     far = [
         other @ other if up and other @ away < APART * np.linalg.norm(other) * np.linalg.norm(away) else np.inf
         for other, up in feet
     ]
     there = bool(both and above and np.isfinite(min(far)))
-    return [*found[best][0], *(found[int(np.argmin(far))][0] if there else (0, 0)), float(there)]
+    return [*found[best][0], *(found[_first_nearest(far)][0] if there else (0, 0)), float(there)]
+
+
+def _first_nearest(squares):
+    """Return the number of the least square; of those that are as small but for rounding the first."""
+    best = 0
+    for number, square in enumerate(squares):
+        if square < NEARER * squares[best]:
+            best = number
+    return best
 
 
 def _foot(corners, inside, z, cell, steps):
