@@ -316,6 +316,7 @@ for (int number = 0;; ++number) {
 SYNC
 REAL *const excesses = s + AT_A;
 int wrong = 0;  // 1: a result is no number, 2: an input is none
+LOOP
 EACH (i, N) {
     const int own = table[T_DOF_OF + i];
     if (own < 0) continue;
@@ -326,8 +327,11 @@ EACH (i, N) {
     if (table[T_COORDINATE + own] >= 0)
         wrong |= joint_space::lost(target_q.data[world * q.shape[1] + table[T_COORDINATE + own]]) ? 2 : 0;
 }
+LOOP
 EACH (i, PV * (PAIRS + SURFACES) + 1) wrong |= joint_space::lost(pair_value[i]) ? 2 : 0;
+LOOP
 EACH (i, DV * DOFS) wrong |= joint_space::lost(dof_value[i]) ? 2 : 0;
+LOOP
 EACH (i, SURFACES) missed = surface[i * SURFACE + 10] > 0 ? (REAL)1e30 : missed;  // comes out of the ground slowly
 excesses[5 * lane] = cone;
 excesses[5 * lane + 1] = pull;
@@ -350,6 +354,7 @@ if (alive) {
     EACH (point, CONTACT_POINTS) {  // all surfaces of a point with the ground have slots
         REAL f[3] = {0, 0, 0}, gap = 0, slip = 0;
         bool any = false;
+        LOOP
         for (int at = 0; at < slots; ++at) {
             const int where = slot_of[at];
             if (where < NEAR * MOST || table[T_PAIR + 2 * joint_space::pair_of(nears, where) + 1] != point) continue;
@@ -387,6 +392,7 @@ if (alive) {
     if (lane == 0) {
         REAL worst[4] = {0, 0, 0, 0};
         int all_wrong = 0;
+        LOOP
         for (int l = 0; l < LANES; ++l) {
             for (int e = 0; e < 4; ++e) worst[e] = excesses[5 * l + e] > worst[e] ? excesses[5 * l + e] : worst[e];
             all_wrong |= (int)excesses[5 * l + 4];

@@ -181,6 +181,7 @@ if (lane == 0) {
         for (int i = 0; i < MOST; ++i)
             if (keep[k] >> i & 1) slot_of[slots++] = k * MOST + i;
     }
+    LOOP
     for (int i = 0; i < SURFACES; ++i) {
         const int couple = table[T_PAIR + 2 * (PAIRS + i)];
         if (couple != before) {
@@ -253,7 +254,9 @@ SYNC
 if (lane == 0) {
     for (int k = 0; k < runs; ++k) {
         const int* const row = table + T_COUPLE + (1 + MB) * run_couple[k];
+        LOOP
         for (int c = 0; c < row[0]; ++c)
+            LOOP
             for (int a = 0; a < row[0]; ++a) {
                 const int low = row[1 + c] & 255, high = row[1 + a] & 255;
                 if (high > low) mask[low * WORDS + high / 64] |= 1ull << (high & 63);

@@ -1,7 +1,8 @@
 """Pairs of shapes that are near each other, and the points that they share, for :mod:`.joint_space`.
 
-A warp a world looks at the balls around the shapes of all pairs and lists those that are near, in the order of the
-scene; where more are near than the list takes, those whose balls overlap most stay. A thread a near pair then finds
+A warp a world looks at the balls around the shapes of all pairs, and at the box around each and the ball around the
+other, and lists those that are near, in the order of the scene; where more are near than the list takes, those that
+overlap most stay. A thread a near pair then finds
 its points by :mod:`.convex_pairs`. The lists do not depend on the order of threads.
 
 Two shapes are near where they are no farther apart than ``slack``, and what both can move in a step, twice: a body
@@ -19,9 +20,9 @@ from .elementary import C_TYPE
 from .joint_space import MOST, POINT
 
 LANES = 32
-SIDE = ("x", "y", "z", "qx", "qy", "qz", "qw", "arm", "ball")
-"""Constants of a shape of a pair: its pose in the body, how far it reaches from the body's CoM, and the radius of the
-ball around it [m]."""
+SIDE = ("x", "y", "z", "qx", "qy", "qz", "qw", "size_x", "size_y", "size_z", "arm", "ball")
+"""Constants of a shape of a pair: its pose in the body, half the sizes of the box around it, how far it reaches from
+the body's CoM, and the radius of the ball around it [m]."""
 WHICH = ("body", "shape")
 """Integers of a shape of a pair; body -1 is the inertial frame."""
 
@@ -46,6 +47,24 @@ struct turned
         }
         by(pose + 3, side, y);
         for (int c = 0; c < 3; ++c) y[c] += pose[c];
+    }
+
+    // How far a place is from the box around a shape, both from the shape's middle.
+    static CUDA_CALLABLE inline REAL outside(const REAL* pose, const REAL* side, const REAL* from)
+    {
+        REAL x[3] = {from[0], from[1], from[2]}, y[3], apart = 0;
+        if (pose) {
+            const REAL back[4] = {-pose[3], -pose[4], -pose[5], pose[6]};
+            by(back, x, y);
+            for (int c = 0; c < 3; ++c) x[c] = y[c];
+        }
+        const REAL back[4] = {-side[3], -side[4], -side[5], side[6]};
+        by(back, x, y);
+        for (int c = 0; c < 3; ++c) {
+            const REAL beyond = (y[c] < 0 ? -y[c] : y[c]) - side[BOX + c];
+            apart += beyond > 0 ? beyond * beyond : 0;
+        }
+        return sqrt(apart);
     }
 
     // How far apart the balls around two shapes may be to be near, from the velocities of their bodies.
@@ -84,10 +103,17 @@ struct balls
             const int body = which[(2 * pair + side) * WHICH];
             turned::middle(body < 0 ? nullptr : poses + 7 * body, sides + (2 * pair + side) * SIDE, at + 3 * side);
         }
-        REAL apart = 0;
-        for (int c = 0; c < 3; ++c) apart += (at[c] - at[3 + c]) * (at[c] - at[3 + c]);
-        return sides[2 * pair * SIDE + SIDE - 1] + sides[(2 * pair + 1) * SIDE + SIDE - 1] - sqrt(apart)
-            + turned::reach(rates, which, sides, pair, slack, h);
+        const REAL *const one = sides + 2 * pair * SIDE, *const other = one + SIDE;
+        const REAL from[3] = {at[3] - at[0], at[4] - at[1], at[5] - at[2]}, back[3] = {-from[0], -from[1], -from[2]};
+        const REAL apart = sqrt(from[0] * from[0] + from[1] * from[1] + from[2] * from[2]);
+        const REAL reach = turned::reach(rates, which, sides, pair, slack, h);
+        REAL found = one[SIDE - 1] + other[SIDE - 1] - apart + reach;
+        if (!(found > 0)) return found;
+        const int a = which[2 * pair * WHICH], b = which[(2 * pair + 1) * WHICH];
+        const REAL there = other[SIDE - 1] + reach - turned::outside(a < 0 ? nullptr : poses + 7 * a, one, from);
+        const REAL here = one[SIDE - 1] + reach - turned::outside(b < 0 ? nullptr : poses + 7 * b, other, back);
+        found = there < found ? there : found;
+        return here < found ? here : found;
     }
 };
 const REAL* const own = poses.data + world * poses.shape[1] * 7;
@@ -163,7 +189,8 @@ list[1 + NEAR + k] = convex::collide(shape[0], shape[1], tables, at[0], turn[0],
 
 def _text(body: str, pairs: int, near: int, T: type) -> str:
     sizes = {
-        "PAIRS": pairs, "NEAR": near, "SIDE": len(SIDE), "ARM": SIDE.index("arm"), "WHICH": len(WHICH), "MOST": MOST,
+        "PAIRS": pairs, "NEAR": near, "SIDE": len(SIDE), "ARM": SIDE.index("arm"), "BOX": SIDE.index("size_x"),
+        "WHICH": len(WHICH), "MOST": MOST,
         "POINT": POINT, "ROW": convex_pairs.ROW, "SIZES": convex_pairs.SIZES,
     }  # fmt: skip
     constants = f"enum {{ {', '.join(f'{name} = {x}' for name, x in sizes.items())} }};\n"

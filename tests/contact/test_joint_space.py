@@ -205,7 +205,7 @@ def test_users_get_it_where_many_links_are_tied(device):
         dense.append(wanted.on.sum())
     assert min(dense) >= 28 and (found["status"] == spo.Status.OK).all()
     line = next(line for line in dyn.explain().splitlines() if line.startswith("contacts"))
-    assert "21 of 28 pairs may be near each other in a world, and 84 points of them have slots" in line
+    assert "16 of 28 pairs may be near each other in a world, and 64 points of them have slots" in line
 
 
 def test_small_scenes_keep_generated_code():
@@ -269,6 +269,17 @@ def test_nan_stays_in_its_world(device):
     assert found["status"].tolist() == [spo.Status.NOT_FINITE, spo.Status.OK]
     for name in ("q", "qd", "contact_f", "contact_gap"):
         np.testing.assert_array_equal(found[name][1], clean[name][1])
+
+
+def test_near_pairs_are_chosen_by_boxes(device):
+    """A table reaches far beyond each cube; those on it are in the list with it, and those above it are not."""
+    dyn, q, qd = row_step(str(device), "float64")
+    lifted = q.copy()
+    lifted[1, 2::7] += 0.1
+    dyn.step(lifted, qd, None, H)
+    solver, cubes = dyn._joint_space, 7
+    found = solver.near.numpy().reshape(2, -1)[:, 0]
+    assert found.tolist() == [cubes - 1 + cubes, cubes - 1]
 
 
 @pytest.mark.parametrize("speed", [2.0, 40.0, 400.0])

@@ -36,9 +36,9 @@ ROOM = 227 * 1024  # shared memory of a block [bytes]
 MARGIN = 5e-3  # how near shapes are looked at whatever their speeds [m]; a drive at 1000 m/s^2 moves so far in 3 ms
 TINY = 1e-9  # radius of a point among shapes [m]
 NO_ROOM = "a world in joint space is larger than the shared memory of a block"
-NEAR, NEAR_A_BODY, POINTS = 16, 3, 4
-"""Pairs that are near in a world: so many, or so many for each body of a pair; points of each that get slots, if the
-pairs have so many. A cube among others lies on one or two and has one on it."""
+NEAR, NEAR_A_BODY, FULL = 16, 2, 8
+"""Pairs that may be near in a world: so many, or so many for each body of a pair. Of FULL of them, or of as many as
+there are such bodies, all points have slots. In a pile a body lies on one or two others, mostly with four points."""
 
 
 def reason_against(scene: Scene, variable: tuple[str, ...]) -> str:
@@ -63,9 +63,8 @@ def choose_slots(scene: Scene) -> tuple[int, int]:
     """Return how many pairs may be near in a world, and how many of their points get slots."""
     pairs = scene.contact_pairs
     bodies = {body for pair in pairs for body in (pair.body, pair.other) if body >= 0}
-    near = min(len(pairs), max(NEAR, NEAR_A_BODY * len(bodies)))
-    points = sorted((min(_points(*pair.shapes), POINTS) for pair in pairs), reverse=True)
-    return near, sum(points[:near])
+    points = sorted((_points(*pair.shapes) for pair in pairs), reverse=True)
+    return min(len(pairs), max(NEAR, NEAR_A_BODY * len(bodies))), sum(points[: max(FULL, len(bodies))])
 
 
 def _points(one: ConvexShape, other: ConvexShape) -> int:
@@ -82,7 +81,7 @@ class JointSpaceStep:
     Args:
         dyn: of the scene.
         near: pairs of shapes at most that are near each other in a world. slots: points of these at most. None: as
-            :func:`choose_slots` says.
+            :func:`choose_slots` says; fewer where shared memory is too small for a world.
         lanes: threads of a world on a GPU: 8, 16 or 32; None: by the number of worlds.
         registers: of a thread at most; None: as the compiler chooses.
         margin: how near shapes must be to be looked at where nothing moves [m].
@@ -108,8 +107,12 @@ class JointSpaceStep:
         self.slot_count = slots = chosen[1] if slots is None else slots
         pattern = dyn.mass_matrix_pattern
         surfaces = surface_numbers(scene, HEIGHTS in dyn.variable)
-        self.tables = tables = joint_tables(scene, pattern, near, slots, surfaces)
+        tables = joint_tables(scene, pattern, near, slots, surfaces)
         sizes = tables.sizes
+        while self.device.is_cuda and slots > near and joint_space.world_bytes(sizes, T) > ROOM:
+            self.slot_count = slots = max(near, slots - 8)
+            sizes = sizes._replace(slots=slots + sizes.surfaces)
+        self.tables = tables = tables._replace(sizes=sizes)
         crowded = 2 * joint_space.world_bytes(sizes, T) > MOST_SHARED
         self.lanes = lanes or (32 if crowded or dyn.worlds <= FEW else 16)
         array: Any = functools.partial(wp.array, dtype=T, device=self.device)
@@ -165,12 +168,14 @@ class JointSpaceStep:
             for body, shape in zip((pair.body, pair.other), pair.shapes, strict=True):
                 row = numbers[id(shape)]
                 at = shape.pose[:3] + rotated(shape.pose[3:], rows.middles[row])
+                sizes = shape.size + shape.radius
                 ball = float(np.linalg.norm(shape.size)) + shape.radius
                 if shape.hull is not None:
-                    ball = float(np.linalg.norm(shape.hull.corners - rows.middles[row], axis=1).max())
+                    corners = shape.hull.corners - rows.middles[row]
+                    sizes, ball = np.abs(corners).max(axis=0), float(np.linalg.norm(corners, axis=1).max())
                 com = scene.values["body_com"][0, body] if body >= 0 else at
                 which.append([body, row])
-                sides.append([*at, *shape.pose[3:], float(np.linalg.norm(at - com)) + ball, ball])
+                sides.append([*at, *shape.pose[3:], *sizes, float(np.linalg.norm(at - com)) + ball, ball])
         assert not sides or len(sides[0]) == len(near_pairs.SIDE)
         self.which, self.sides = array(np.ravel(which), dtype=int), array(np.ravel(sides))
         routines = rows.routines([which[i][1::2] + which[i + 1][1::2] for i in range(0, len(which), 2)])
