@@ -9,11 +9,10 @@ for (int number = 0;; ++number) {
     const bool first = number == 0, last = number == pass_count - 1 && pass_count >= 3, done = number == pass_count;
     // -- laws of the points; after the last pass only what they say of it
     EACH (at, slots) {
-        const int where = slot_of[at], pair = nears[1 + where / MOST];
+        const int where = slot_of[at], pair = joint_space::pair_of(nears, where);
         const int* const row = table + T_COUPLE + (1 + MB) * table[T_PAIR + 2 * pair];
-        const REAL* const value = pair_values.data + PV * pair;
-        const REAL share = (REAL)1 / nears[1 + NEAR + where / MOST];
-        const REAL k = value[P_STIFFNESS] * share, kd = FMA(k, h, value[P_DAMPING] * share), mu = value[P_FRICTION];
+        const REAL* const value = pair_value + PV * pair;
+        const REAL kd = slot[KD * S + at], mu = value[P_FRICTION], spring = slot[PUSH * S + at];
         const REAL depth = slot[DEPTH * S + at];
         const REAL before[3] = {slot[U0 * S + at], slot[(U0 + 1) * S + at], slot[(U0 + 2) * S + at]};
         REAL u[3] = {before[0], before[1], before[2]};
@@ -30,7 +29,7 @@ for (int number = 0;; ++number) {
         }
         const int flags = (int)slot[FLAG * S + at];
         const bool shut = flags & 1;
-        const REAL push = FMA(k, depth, -(kd * u[0])), slip = sqrt(FMA(u[1], u[1], u[2] * u[2]));
+        const REAL push = FMA(-kd, u[0], spring), slip = sqrt(FMA(u[1], u[1], u[2] * u[2]));
         REAL across = slot[ACROSS * S + at], w = slip;
         bool candidate;
         REAL fn;
@@ -46,6 +45,8 @@ for (int number = 0;; ++number) {
             if (done) {
                 cone = over > cone ? over : cone;
                 pull = -normal > pull ? -normal : pull;
+                const REAL lacks = shut || !candidate ? 0 : joint_space::positive(push);
+                missed = lacks > missed ? lacks : missed;
                 slot[F * S + at] = normal;
                 slot[(F + 1) * S + at] = -across * u[1];
                 slot[(F + 2) * S + at] = -across * u[2];
@@ -59,7 +60,7 @@ for (int number = 0;; ++number) {
         slot[FLAG * S + at] = closed + 2 * candidate;
         slot[CN * S + at] = closed ? h * kd : 0;
         slot[CT * S + at] = h * across;
-        slot[F * S + at] = closed ? h * FMA(k, depth, -(kd * before[0])) : 0;
+        slot[F * S + at] = closed ? h * FMA(-kd, before[0], spring) : 0;
         slot[(F + 1) * S + at] = -h * across * before[1];
         slot[(F + 2) * S + at] = -h * across * before[2];
     }
@@ -71,7 +72,7 @@ for (int number = 0;; ++number) {
             dof[R * N + i] = 0;
             continue;
         }
-        const REAL* const value = dof_values.data + DV * own;
+        const REAL* const value = dof_value + DV * own;
         const int coordinate = table[T_COORDINATE + own];
         const REAL before = dof[V0 * N + i], v = first ? before : before + dof[X * N + i];
         const REAL at = coordinate < 0 ? 0 : q.data[world * q.shape[1] + coordinate], effort = value[C_EFFORT];
@@ -255,7 +256,7 @@ for (int number = 0;; ++number) {
         if (!more) break;
         EACH (at, slots) {
             const int* const row = table + T_COUPLE
-                + (1 + MB) * table[T_PAIR + 2 * nears[1 + slot_of[at] / MOST]];
+                + (1 + MB) * table[T_PAIR + 2 * joint_space::pair_of(nears, slot_of[at])];
             REAL u[3] = {0, 0, 0};
             LOOP
             for (int c = 0; c < row[0]; ++c) {
@@ -314,19 +315,59 @@ for (int number = 0;; ++number) {
 // -- results
 SYNC
 REAL *const excesses = s + AT_A;
-excesses[3 * lane] = cone;
-excesses[3 * lane + 1] = pull;
-excesses[3 * lane + 2] = effort_excess;
+int wrong = 0;  // 1: a result is no number, 2: an input is none
+LOOP
+EACH (i, N) {
+    const int own = table[T_DOF_OF + i];
+    if (own < 0) continue;
+    const long long at = world * DOFS + own;
+    wrong |= joint_space::lost(dof[X * N + i]);
+    const REAL given = tau.data[at] + qd.data[at] + target_qd.data[at] + bias.data[at];
+    wrong |= joint_space::lost(given) ? 2 : 0;
+    if (table[T_COORDINATE + own] >= 0)
+        wrong |= joint_space::lost(target_q.data[world * q.shape[1] + table[T_COORDINATE + own]]) ? 2 : 0;
+}
+LOOP
+EACH (i, PV * (PAIRS + SURFACES) + 1) wrong |= joint_space::lost(pair_value[i]) ? 2 : 0;
+LOOP
+EACH (i, DV * DOFS) wrong |= joint_space::lost(dof_value[i]) ? 2 : 0;
+LOOP
+EACH (i, SURFACES) missed = surface[i * SURFACE + 10] > 0 ? (REAL)1e30 : missed;  // comes out of the ground slowly
+excesses[5 * lane] = cone;
+excesses[5 * lane + 1] = pull;
+excesses[5 * lane + 2] = effort_excess;
+excesses[5 * lane + 3] = missed;
+excesses[5 * lane + 4] = (REAL)wrong;
 if (alive) {
     EACH (i, N) {
         const int own = table[T_DOF_OF + i];
-        if (own >= 0) out.data[world * DOFS + own] = dof[V0 * N + i] + dof[X * N + i];
+        if (own < 0) continue;
+        qdd.data[world * DOFS + own] = dof[X * N + i] / h;
+        out.data[world * DOFS + own] = dof[V0 * N + i] + dof[X * N + i];
     }
     EACH (k, PAIRS) {
         const long long row = world * contact_f.shape[1] + table[T_PAIR + 2 * k + 1];
         for (int c = 0; c < 3; ++c) contact_f.data[row * 3 + c] = 0;
         contact_gap.data[row] = AWAY;
         contact_slip.data[row] = 0;
+    }
+    EACH (point, CONTACT_POINTS) {  // all surfaces of a point with the ground have slots
+        REAL f[3] = {0, 0, 0}, gap = 0, slip = 0;
+        bool any = false;
+        LOOP
+        for (int at = 0; at < slots; ++at) {
+            const int where = slot_of[at];
+            if (where < NEAR * MOST || table[T_PAIR + 2 * joint_space::pair_of(nears, where) + 1] != point) continue;
+            const REAL* const found = joint_space::point_of(touch, surface, where);
+            joint_space::add_force(found + 3, slot + F * S + at, S, f);
+            if (!any) slip = slot[ACROSS * S + at];
+            gap = !any || found[9] < gap ? found[9] : gap;
+            any = true;
+        }
+        const long long row = world * contact_f.shape[1] + point;
+        for (int c = 0; c < 3; ++c) contact_f.data[row * 3 + c] = f[c];
+        contact_gap.data[row] = gap;
+        contact_slip.data[row] = slip;
     }
 }
 SYNC
@@ -336,16 +377,12 @@ if (alive) {
         REAL f[3] = {0, 0, 0}, deepest = -AWAY, slip = 0;
         for (int at = 0; at < slots; ++at) {
             const int where = slot_of[at];
-            if (where / MOST != k) continue;
+            if (where >= NEAR * MOST || where / MOST != k) continue;
             if (slot[DEPTH * S + at] > deepest) {
                 deepest = slot[DEPTH * S + at];
                 slip = slot[ACROSS * S + at];
             }
-            REAL axes[9];
-            for (int r = 0; r < 3; ++r) axes[r] = touch[where * POINT + 3 + r];
-            joint_space::tangents(axes, axes + 3, axes + 6);
-            for (int r = 0; r < 3; ++r)
-                for (int c = 0; c < 3; ++c) f[c] = FMA(axes[3 * r + c], slot[(F + r) * S + at], f[c]);
+            joint_space::add_force(touch + where * POINT + 3, slot + F * S + at, S, f);
         }
         const long long row = world * contact_f.shape[1] + table[T_PAIR + 2 * nears[1 + k] + 1];
         for (int c = 0; c < 3; ++c) contact_f.data[row * 3 + c] = f[c];
@@ -353,12 +390,18 @@ if (alive) {
         contact_slip.data[row] = slip;
     }
     if (lane == 0) {
-        for (int e = 0; e < 3; ++e) {
-            REAL worst = 0;
-            for (int l = 0; l < LANES; ++l) worst = excesses[3 * l + e] > worst ? excesses[3 * l + e] : worst;
-            excess.data[world * 3 + e] = worst;
+        REAL worst[4] = {0, 0, 0, 0};
+        int all_wrong = 0;
+        LOOP
+        for (int l = 0; l < LANES; ++l) {
+            for (int e = 0; e < 4; ++e) worst[e] = excesses[5 * l + e] > worst[e] ? excesses[5 * l + e] : worst[e];
+            all_wrong |= (int)excesses[5 * l + 4];
         }
-        status.data[world] = total > S || nears[0] > NEAR ? CROWDED : 0;
+        for (int e = 0; e < 3; ++e) excess.data[world * 3 + e] = worst[e];
+        const bool beyond = worst[0] > most_force || worst[1] > most_force || worst[3] > most_force
+            || worst[2] > most_effort;
+        const bool crowded = total > S - SURFACES || nears[0] > NEAR;
+        status.data[world] = all_wrong & 2 ? NOT_FINITE : all_wrong ? PIVOT : crowded ? CROWDED : beyond ? CONTACT : 0;
     }
 }
 #undef LANES

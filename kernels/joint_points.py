@@ -79,6 +79,29 @@ struct joint_space
         }
     }
 
+    // The pair of a point, where those with the ground follow the others, and its place, normal and depth.
+    static CUDA_CALLABLE inline int pair_of(const int* nears, int where)
+    {
+        return where < NEAR * MOST ? nears[1 + where / MOST] : PAIRS + where - NEAR * MOST;
+    }
+
+    static CUDA_CALLABLE inline const REAL* point_of(const REAL* touch, const REAL* surface, int where)
+    {
+        return where < NEAR * MOST ? touch + where * POINT : surface + (where - NEAR * MOST) * SURFACE;
+    }
+
+    static CUDA_CALLABLE inline bool lost(REAL x) { return !(x - x == 0); }
+
+    // Adds a point's force in its axes to one in inertial axes.
+    static CUDA_CALLABLE inline void add_force(const REAL* normal, const REAL* f, int apart, REAL* to)
+    {
+        REAL axes[9];
+        for (int r = 0; r < 3; ++r) axes[r] = normal[r];
+        tangents(axes, axes + 3, axes + 6);
+        for (int r = 0; r < 3; ++r)
+            for (int c = 0; c < 3; ++c) to[c] = FMA(axes[3 * r + c], f[r * apart], to[c]);
+    }
+
     // Two unit vectors across a normal.
     static CUDA_CALLABLE inline void tangents(const REAL* n, REAL* one, REAL* other)
     {
@@ -108,31 +131,30 @@ REAL* const s = (REAL*)bytes;
 Tile* const A = (Tile*)(s + AT_A);
 REAL *const J = s + AT_J, *const slot = s + AT_SLOT, *const dof = s + AT_DOF, *const held_mass = s + AT_M;
 unsigned long long* const mask = (unsigned long long*)(bytes + AT_MASK);
-int *const run_start = (int*)(bytes + AT_RUN), *const run_couple = run_start + NEAR + 1;
+int *const run_start = (int*)(bytes + AT_RUN), *const run_couple = run_start + NEAR + SURFACES + 1;
 int *const slot_of = (int*)(bytes + AT_SLOT_OF), *const keep = (int*)(bytes + AT_KEEP);
 int* const count = (int*)(bytes + AT_COUNT);
 unsigned char* const rows = (unsigned char*)(bytes + AT_ROWS);
 enum { V0, X, DRIVE, DRY, LOAD, LIMIT, D, R, I0, L10, I1, CHANGE };
-enum { U0, CN = 3, CT, F, DEPTH = 8, ACROSS, FLAG };
+enum { U0, CN = 3, CT, F, DEPTH = 8, ACROSS, FLAG, PUSH, KD };
 const int* const table = place.data;
 const int* const nears = near.data + world * (1 + 2 * NEAR);
 const REAL* const touch = touches.data + world * (NEAR * MOST * POINT);
+const REAL* const surface = surfaces.data + world * surfaces.shape[1];
+const REAL* const dof_value = dof_values.data + (dof_values.shape[0] > 1 ? world : 0) * dof_values.shape[1];
+const REAL* const pair_value = pair_values.data + (pair_values.shape[0] > 1 ? world : 0) * pair_values.shape[1];
+const REAL half_gravity = pair_value[PV * (PAIRS + SURFACES)];
 const int number_near = nears[0] < NEAR ? nears[0] : NEAR;
 const int pass_count = (int)passes;
 
-// -- slots: all points of the near pairs, or the deepest ones where there are more than slots
-EACH (k, number_near) {
-    int kept = 0;
-    for (int i = 0; i < nears[1 + NEAR + k]; ++i)
-        if (touch[(k * MOST + i) * POINT + 6] > -margin) kept |= 1 << i;
-    keep[k] = kept;
-}
+// -- slots: all points with the ground, and those of the near pairs, or of these the deepest where slots are too few
+EACH (k, number_near) keep[k] = (1 << nears[1 + NEAR + k]) - 1;
 SYNC
 int total = 0;
 for (int k = 0; k < number_near; ++k)
     for (int left = keep[k]; left; left &= left - 1) ++total;
 SYNC
-if (total > S) EACH (k, number_near) {
+if (total > S - SURFACES) EACH (k, number_near) {
     const int points = nears[1 + NEAR + k];
     int kept = keep[k];
     for (int i = 0; i < points; ++i) {
@@ -143,7 +165,7 @@ if (total > S) EACH (k, number_near) {
                 const REAL other = touch[(l * MOST + j) * POINT + 6];
                 deeper += other > depth || (other == depth && l * MOST + j < k * MOST + i);
             }
-        if (deeper >= S) kept &= ~(1 << i);
+        if (deeper >= S - SURFACES) kept &= ~(1 << i);
     }
     keep[k] = kept;
 }
@@ -159,13 +181,22 @@ if (lane == 0) {
         for (int i = 0; i < MOST; ++i)
             if (keep[k] >> i & 1) slot_of[slots++] = k * MOST + i;
     }
+    LOOP
+    for (int i = 0; i < SURFACES; ++i) {
+        const int couple = table[T_PAIR + 2 * (PAIRS + i)];
+        if (couple != before) {
+            run_start[runs] = slots;
+            run_couple[runs++] = before = couple;
+        }
+        slot_of[slots++] = NEAR * MOST + i;
+    }
     run_start[runs] = slots;
-    run_couple[NEAR] = runs;
+    run_couple[NEAR + SURFACES] = runs;
 }
 // -- what dofs do: an axis, and a point on it, inertial; then velocities and loads
 EACH (i, DOFS) {
     REAL* const to = s + AT_A + 6 * i;
-    const REAL* const value = dof_values.data + DV * i;
+    const REAL* const value = dof_value + DV * i;
     const int axis_body = table[T_AXIS_BODY + i], body = table[T_POINT_BODY + i];
     const REAL* const pose = poses.data + (world * poses.shape[1] + body) * 7;
     if (axis_body >= 0) {
@@ -184,18 +215,20 @@ EACH (i, N) {
 }
 EACH (e, NNZ) held_mass[e] = mass.data[world * NNZ + e];
 SYNC
-const int runs = run_couple[NEAR], slots = run_start[runs];
+const int runs = run_couple[NEAR + SURFACES], slots = run_start[runs];
 // -- Jacobians, in the axes of each point: normal, across, across
 LOOP
 for (int item = lane; item < slots * MB; item += LANES) {
     const int at = item / MB, c = item - at * MB, where = slot_of[at];
-    const int couple = table[T_PAIR + 2 * nears[1 + where / MOST]], *const row = table + T_COUPLE + (1 + MB) * couple;
+    const int couple = table[T_PAIR + 2 * joint_space::pair_of(nears, where)];
+    const int* const row = table + T_COUPLE + (1 + MB) * couple;
     if (c >= row[0]) continue;
+    const REAL* const found = joint_space::point_of(touch, surface, where);
     const int block = row[1 + c] & 255;
     REAL axes[9], point[3];
     for (int r = 0; r < 3; ++r) {
-        point[r] = touch[where * POINT + r];
-        axes[r] = touch[where * POINT + 3 + r];
+        point[r] = found[r];
+        axes[r] = found[3 + r];
     }
     joint_space::tangents(axes, axes + 3, axes + 6);
     UNROLL
@@ -203,7 +236,7 @@ for (int item = lane; item < slots * MB; item += LANES) {
         const int sign = (row[1 + c] >> (8 + 2 * d) & 3) - 1, own = table[T_DOF_OF + 2 * block + d];
         REAL column[3] = {0, 0, 0};
         if (sign) {
-            const REAL *const axis = s + AT_A + 6 * own, *const value = dof_values.data + DV * own;
+            const REAL *const axis = s + AT_A + 6 * own, *const value = dof_value + DV * own;
             REAL arm[3];
             for (int r = 0; r < 3; ++r) arm[r] = point[r] - axis[3 + r];
             joint_space::cross(axis, arm, column);
@@ -215,42 +248,59 @@ for (int item = lane; item < slots * MB; item += LANES) {
     }
 }
 // -- rows of each column of tiles: of the tree, of the couples that are near, and what elimination fills
-EACH (j, NB)
+EACH (j, NB * WORDS)
     mask[j] = (unsigned int)table[T_MASK + 2 * j] | (unsigned long long)(unsigned int)table[T_MASK + 2 * j + 1] << 32;
 SYNC
 if (lane == 0) {
     for (int k = 0; k < runs; ++k) {
         const int* const row = table + T_COUPLE + (1 + MB) * run_couple[k];
-        unsigned long long all = 0;
-        for (int c = 0; c < row[0]; ++c) all |= 1ull << (row[1 + c] & 255);
-        for (int c = 0; c < row[0]; ++c) mask[row[1 + c] & 255] |= all & ~((2ull << (row[1 + c] & 255)) - 1);
+        LOOP
+        for (int c = 0; c < row[0]; ++c)
+            LOOP
+            for (int a = 0; a < row[0]; ++a) {
+                const int low = row[1 + c] & 255, high = row[1 + a] & 255;
+                if (high > low) mask[low * WORDS + high / 64] |= 1ull << (high & 63);
+            }
     }
-    for (int j = 0; j < NB; ++j)
-        if (mask[j]) {
-            const int over = joint_space::first_of(mask[j]);
-            mask[over] |= mask[j] & ~(1ull << over);
-        }
+    for (int j = 0; j < NB; ++j) {
+        int w = 0;
+        while (w < WORDS && !mask[j * WORDS + w]) ++w;
+        if (w == WORDS) continue;
+        const int over = 64 * w + joint_space::first_of(mask[j * WORDS + w]);
+        for (; w < WORDS; ++w)
+            mask[over * WORDS + w] |= mask[j * WORDS + w] & (w == over / 64 ? ~(1ull << (over & 63)) : ~0ull);
+    }
 }
 SYNC
 EACH (j, NB) {
     int found = 0;
-    for (unsigned long long left = mask[j]; left; left &= left - 1)
-        rows[j * (NB + 1) + found++] = (unsigned char)joint_space::first_of(left);
+    for (int w = 0; w < WORDS; ++w)
+        for (unsigned long long left = mask[j * WORDS + w]; left; left &= left - 1)
+            rows[j * (NB + 1) + found++] = (unsigned char)(64 * w + joint_space::first_of(left));
     rows[j * (NB + 1) + found++] = NB;
     count[j] = found;
 }
 // -- velocities of the points before the step
 EACH (at, slots) {
-    const int where = slot_of[at], *const row = table + T_COUPLE
-        + (1 + MB) * table[T_PAIR + 2 * nears[1 + where / MOST]];
+    const int where = slot_of[at], pair = joint_space::pair_of(nears, where);
+    const int* const row = table + T_COUPLE + (1 + MB) * table[T_PAIR + 2 * pair];
+    const REAL *const value = pair_value + PV * pair, *const found = joint_space::point_of(touch, surface, where);
     REAL u[3] = {0, 0, 0};
     for (int c = 0; c < row[0]; ++c)
         for (int r = 0; r < 3; ++r)
             for (int d = 0; d < 2; ++d)
                 u[r] = FMA(J[(at * MB + c) * 6 + 2 * r + d], dof[V0 * N + 2 * (row[1 + c] & 255) + d], u[r]);
     for (int r = 0; r < 3; ++r) slot[(U0 + r) * S + at] = u[r];
-    slot[DEPTH * S + at] = touch[where * POINT + 6];
+    slot[DEPTH * S + at] = found[6];
+    if (pair < PAIRS) {  // a pair's law is shared by its points
+        const REAL share = (REAL)1 / nears[1 + NEAR + where / MOST], k = value[P_STIFFNESS] * share;
+        slot[PUSH * S + at] = k * found[6];
+        slot[KD * S + at] = FMA(k, h, value[P_DAMPING] * share);
+    } else {
+        slot[PUSH * S + at] = found[7];
+        slot[KD * S + at] = FMA(value[P_STIFFNESS], h, found[8]);
+    }
     slot[FLAG * S + at] = slot[ACROSS * S + at] = 0;
 }
-REAL cone = 0, pull = 0, effort_excess = 0;
+REAL cone = 0, pull = 0, effort_excess = 0, missed = 0;
 """

@@ -21,25 +21,31 @@ import warp as wp
 from . import joint_passes, joint_points, native
 from .elementary import C_TYPE, FUSED
 
-SLOTS = 9  # as warp_spo.Status, which kernels cannot import; a test compares
-AWAY = 1e3  # gap of pairs that are not near [m]
+WORDS = {"PIVOT": 1, "NOT_FINITE": 2, "CONTACT": 8, "CROWDED": 9}
+"""Status words, as warp_spo.Status, which kernels cannot import; a test compares."""
 BLOCK = 32  # threads of a block: a warp
 MOST, POINT = 8, 7  # points of a near pair; entries of a point: place, normal towards the first body, depth
-DOF_FIELDS, SLOT_FIELDS = 12, 11
+SURFACE = 11
+"""Entries of a surface of the ground at a point: place, normal, depth; push and damping of its law; gap; 1 where the
+point comes out slowly."""
+DOF_FIELDS, SLOT_FIELDS = 12, 13
 DOF_VALUES = (
     "stiffness", "rest", "damping", "ke", "kd", "effort", "dry", "fastest", "brake", "weight",
     "lower", "upper", "limit_ke", "limit_kd", "linear", "angular", "axis_x", "axis_y", "axis_z", "x", "y", "z",
 )  # fmt: skip
 """Constants of a dof; ``axis`` and ``x`` are in the axes of the bodies that the tables name."""
 PAIR_VALUES = ("stiffness", "damping", "friction", "eps", "weight")
-NUMBERS = ("h", "passes", "half_gravity", "margin")
+"""Constants of a pair, and then of a surface at a point with the ground; after all of them, half of gravity."""
+NUMBERS = ("h", "passes", "most_force", "most_effort")
 ARGUMENTS = [
     ("mass", 2), ("bias", 2), ("tau", 2), ("q", 2), ("qd", 2), ("target_q", 2), ("target_qd", 2), ("poses", 3),
-    ("near", 1), ("touches", 2), ("dof_values", 1), ("pair_values", 1), ("place", 1),
+    ("near", 1), ("touches", 2), ("surfaces", 2), ("dof_values", 2), ("pair_values", 2), ("place", 1),
     *((name, 0) for name in NUMBERS),
-    ("out", 2), ("contact_f", 3), ("contact_gap", 2), ("contact_slip", 2), ("excess", 2), ("status", 1),
+    ("out", 2), ("qdd", 2), ("contact_f", 3), ("contact_gap", 2), ("contact_slip", 2), ("excess", 2), ("status", 1),
 ]  # fmt: skip
 """Names and numbers of axes.
+
+``dof_values``, ``pair_values``: a row for all worlds, or one for each.
 
 ``bias``, ``tau`` [world, dof]: the bias force, and the hinges' forces.
 ``near`` [world * (1 + 2 near pairs)]: how many pairs are near, which ones, and how many points each has.
@@ -52,7 +58,9 @@ class Sizes(NamedTuple):
     Attributes:
         dofs, tiles: of the scene; block columns of two dofs each.
         entries: of the packed mass matrix. pairs, couples: pairs of shapes, pairs of bodies.
-        columns: block columns of a couple at most. near: pairs at most that are near in a world. slots: points at most.
+        columns: block columns of a couple at most. near: pairs at most that are near in a world. slots: points at most,
+            those with the ground among them.
+        surfaces, points: surfaces of the ground at points, each of which has a slot; points with the ground.
     """
 
     dofs: int
@@ -63,14 +71,21 @@ class Sizes(NamedTuple):
     columns: int
     near: int
     slots: int
+    surfaces: int = 0
+    points: int = 0
+
+    @property
+    def words(self) -> int:
+        """How many words of 64 bits a mask of tiles has."""
+        return -(-self.tiles // 64)
 
     @property
     def table_starts(self) -> dict[str, int]:
         """Where each table of integers begins in ``place``, in this order, and how long all are."""
         sizes = {
-            "DOF_OF": 2 * self.tiles, "ENTRY": self.entries, "MASK": 2 * self.tiles,
-            "COUPLE": (1 + self.columns) * self.couples, "PAIR": 2 * self.pairs, "AXIS_BODY": self.dofs,
-            "POINT_BODY": self.dofs, "COORDINATE": self.dofs, "ROW_START": 2 * self.tiles + 1,
+            "DOF_OF": 2 * self.tiles, "ENTRY": self.entries, "MASK": 2 * self.tiles * self.words,
+            "COUPLE": (1 + self.columns) * self.couples, "PAIR": 2 * (self.pairs + self.surfaces),
+            "AXIS_BODY": self.dofs, "POINT_BODY": self.dofs, "COORDINATE": self.dofs, "ROW_START": 2 * self.tiles + 1,
             "ROW": 2 * self.entries - self.dofs,
         }  # fmt: skip
         starts, at = {}, 0
@@ -84,14 +99,15 @@ def shared_layout(sizes: Sizes, T: type) -> tuple[dict[str, int], int]:
     b, real = sizes.tiles, 4 if T is wp.float32 else 8
     starts, at = {}, 0
     reals = {
-        "AT_A": max(4 * (b * (b + 1) // 2 + b), 6 * sizes.dofs, 96), "AT_J": 6 * sizes.columns * sizes.slots,
+        "AT_A": max(4 * (b * (b + 1) // 2 + b), 6 * sizes.dofs, 5 * BLOCK), "AT_J": 6 * sizes.columns * sizes.slots,
         "AT_SLOT": SLOT_FIELDS * sizes.slots, "AT_DOF": DOF_FIELDS * 2 * b, "AT_M": sizes.entries,
     }  # fmt: skip
     for name, size in reals.items():
         starts[name], at = at, at + -(-size // 4) * 4
     at *= real
     parts = {
-        "AT_MASK": 8 * b, "AT_RUN": 4 * (2 * sizes.near + 3), "AT_SLOT_OF": 4 * sizes.slots, "AT_KEEP": 4 * sizes.near,
+        "AT_MASK": 8 * b * sizes.words, "AT_RUN": 4 * (2 * (sizes.near + sizes.surfaces) + 3),
+        "AT_SLOT_OF": 4 * sizes.slots, "AT_KEEP": 4 * sizes.near,
         "AT_COUNT": 4 * b, "AT_ROWS": b * (b + 1),
     }  # fmt: skip
     for name, size in parts.items():
@@ -117,9 +133,10 @@ def solver(sizes: Sizes, T: type, lanes: int = 32, registers: int | None = None,
         "DOFS": sizes.dofs, "N": 2 * sizes.tiles, "NB": sizes.tiles, "NNZ": sizes.entries, "PAIRS": sizes.pairs,
         "MB": sizes.columns, "NEAR": sizes.near, "S": sizes.slots, "BYTES": size, "MOST": MOST, "POINT": POINT,
         "DV": len(DOF_VALUES), "PV": len(PAIR_VALUES), "TILES": sizes.tiles * (sizes.tiles + 1) // 2 + sizes.tiles,
-        "CROWDED": SLOTS, "REFINE": refine,
+        "REFINE": refine, "SURFACE": SURFACE, "SURFACES": sizes.surfaces, "CONTACT_POINTS": sizes.points,
+        "WORDS": sizes.words,
     }  # fmt: skip
-    constants |= starts | {f"T_{name}": at for name, at in sizes.table_starts.items()}
+    constants |= WORDS | starts | {f"T_{name}": at for name, at in sizes.table_starts.items()}
     constants |= {f"C_{name.upper()}": i for i, name in enumerate(DOF_VALUES)}
     constants |= {f"P_{name.upper()}": i for i, name in enumerate(PAIR_VALUES)}
     c = C_TYPE[T]
@@ -128,7 +145,7 @@ def solver(sizes: Sizes, T: type, lanes: int = 32, registers: int | None = None,
     )
     text = text.replace("UNROLL\n", "#pragma unroll\n").replace("LOOP\n", "#pragma unroll 1\n")
     text = (
-        text.replace("AWAY", f"(REAL){AWAY}")
+        text.replace("AWAY", "(REAL)INFINITY")
         .replace("LANE_COUNT", str(lanes))
         .replace("REAL", c)
         .replace("FMA(", f"FUSED_{c}(")

@@ -1,26 +1,30 @@
 """Pairs of shapes that are near each other, and the points that they share, for :mod:`.joint_space`.
 
-A warp a world looks at the balls around the shapes of all pairs and lists those that are near, in the order of the
-scene; where more are near than the list takes, those whose balls overlap most stay. A thread a near pair then finds
-its points. The lists do not depend on the order of threads.
+A warp a world looks at the balls around the shapes of all pairs, and at the box around each and the ball around the
+other, and lists those that are near, in the order of the scene; where more are near than the list takes, those that
+overlap most stay. A thread a near pair then finds
+its points by :mod:`.convex_pairs`. The lists do not depend on the order of threads.
+
+Two shapes are near where they are no farther apart than ``slack``, and what both can move in a step, twice: a body
+that another one strikes leaves it at most twice as fast as it was struck.
 """
 
 from __future__ import annotations
 
 import functools
-from typing import Any
 
 import warp as wp
 
-from . import narrow_phase, native
-from .elementary import C_TYPE, NATIVE
+from . import convex_pairs, native
+from .elementary import C_TYPE
 from .joint_space import MOST, POINT
 
 LANES = 32
-SIDE = ("x", "y", "z", "qx", "qy", "qz", "qw", "size_x", "size_y", "size_z", "radius", "ball")
-"""Constants of a shape of a pair: its pose in the body, half its sizes, its radius, and that of the ball around it."""
-WHICH = ("body", "box", "hull")
-"""Integers of a shape of a pair; body -1 is the inertial frame, hull -1 none."""
+SIDE = ("x", "y", "z", "qx", "qy", "qz", "qw", "size_x", "size_y", "size_z", "arm", "ball")
+"""Constants of a shape of a pair: its pose in the body, half the sizes of the box around it, how far it reaches from
+the body's CoM, and the radius of the ball around it [m]."""
+WHICH = ("body", "shape")
+"""Integers of a shape of a pair; body -1 is the inertial frame."""
 
 TURN = r"""
 struct turned
@@ -44,6 +48,39 @@ struct turned
         by(pose + 3, side, y);
         for (int c = 0; c < 3; ++c) y[c] += pose[c];
     }
+
+    // How far a place is from the box around a shape, both from the shape's middle.
+    static CUDA_CALLABLE inline REAL outside(const REAL* pose, const REAL* side, const REAL* from)
+    {
+        REAL x[3] = {from[0], from[1], from[2]}, y[3], apart = 0;
+        if (pose) {
+            const REAL back[4] = {-pose[3], -pose[4], -pose[5], pose[6]};
+            by(back, x, y);
+            for (int c = 0; c < 3; ++c) x[c] = y[c];
+        }
+        const REAL back[4] = {-side[3], -side[4], -side[5], side[6]};
+        by(back, x, y);
+        for (int c = 0; c < 3; ++c) {
+            const REAL beyond = (y[c] < 0 ? -y[c] : y[c]) - side[BOX + c];
+            apart += beyond > 0 ? beyond * beyond : 0;
+        }
+        return sqrt(apart);
+    }
+
+    // How far apart the balls around two shapes may be to be near, from the velocities of their bodies.
+    static CUDA_CALLABLE inline REAL reach(const REAL* rates, const int* which, const REAL* sides, int pair, REAL slack,
+        REAL h)
+    {
+        REAL found = slack;
+        for (int side = 0; side < 2; ++side) {
+            const int body = which[(2 * pair + side) * WHICH];
+            if (body < 0) continue;
+            const REAL *const v = rates + 6 * body, *const w = v + 3;
+            found += 2 * h * (sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+                + sides[(2 * pair + side) * SIDE + ARM] * sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]));
+        }
+        return found;
+    }
 };
 """
 BROAD = r"""
@@ -57,28 +94,40 @@ const long long world = thread / LANES;
 if (world >= worlds) return;
 struct balls
 {
-    static CUDA_CALLABLE inline REAL overlap(const REAL* poses, const int* which, const REAL* sides, int pair)
+    // By how much the balls around two shapes overlap once each has come as far as it may.
+    static CUDA_CALLABLE inline REAL overlap(const REAL* poses, const REAL* rates, const int* which, const REAL* sides,
+        int pair, REAL slack, REAL h)
     {
         REAL at[6];
         for (int side = 0; side < 2; ++side) {
             const int body = which[(2 * pair + side) * WHICH];
             turned::middle(body < 0 ? nullptr : poses + 7 * body, sides + (2 * pair + side) * SIDE, at + 3 * side);
         }
-        REAL apart = 0;
-        for (int c = 0; c < 3; ++c) apart += (at[c] - at[3 + c]) * (at[c] - at[3 + c]);
-        return sides[2 * pair * SIDE + SIDE - 1] + sides[(2 * pair + 1) * SIDE + SIDE - 1] - sqrt(apart);
+        const REAL *const one = sides + 2 * pair * SIDE, *const other = one + SIDE;
+        const REAL from[3] = {at[3] - at[0], at[4] - at[1], at[5] - at[2]}, back[3] = {-from[0], -from[1], -from[2]};
+        const REAL apart = sqrt(from[0] * from[0] + from[1] * from[1] + from[2] * from[2]);
+        const REAL reach = turned::reach(rates, which, sides, pair, slack, h);
+        REAL found = one[SIDE - 1] + other[SIDE - 1] - apart + reach;
+        if (!(found > 0)) return found;
+        const int a = which[2 * pair * WHICH], b = which[(2 * pair + 1) * WHICH];
+        const REAL there = other[SIDE - 1] + reach - turned::outside(a < 0 ? nullptr : poses + 7 * a, one, from);
+        const REAL here = one[SIDE - 1] + reach - turned::outside(b < 0 ? nullptr : poses + 7 * b, other, back);
+        found = there < found ? there : found;
+        return here < found ? here : found;
     }
 };
 const REAL* const own = poses.data + world * poses.shape[1] * 7;
 int* const list = near.data + world * (1 + 2 * NEAR);
-REAL least = -margin, none = 1e9;
+const REAL* const rates = velocities.data + world * velocities.shape[1] * 6;
+REAL least = 0, none = 1e9;
 for (int round = 0, rounds = 1; round < rounds; ++round) {
     const bool last = round == rounds - 1;
     const REAL bound = round == 0 || last ? least : (REAL)0.5 * (least + none);
     int found = 0;
     for (int begin = 0; begin < PAIRS; begin += LANES) {
         const int pair = begin + lane;
-        const bool close = pair < PAIRS && balls::overlap(own, place.data, sides.data, pair) > bound;
+        const bool close = pair < PAIRS && balls::overlap(own, rates, place.data, sides.data, pair, slack, h)
+            > bound;
 #if defined(__CUDA_ARCH__)
         const unsigned int all = __ballot_sync(0xffffffffu, close);
         const int before = found + __popc(all & ((1u << lane) - 1));
@@ -107,60 +156,66 @@ const int k = (int)(thread / worlds);
 int* const list = near.data + world * (1 + 2 * NEAR);
 if (k >= NEAR || k >= list[0]) return;
 const int pair = list[1 + k];
-if (pair < 0) {
-    list[1 + NEAR + k] = 0;
-    return;
-}
+list[1 + NEAR + k] = 0;
+if (pair < 0) return;
 const REAL* const own = poses.data + world * poses.shape[1] * 7;
-solids::Solid both[2];
-REAL origin[3] = {0, 0, 0};
+const convex::Tables tables = {corners.data, planes.data, face_starts.data, face_corners.data};
+convex::Shape shape[2];
+REAL at[2][3], turn[2][9];
 for (int side = 0; side < 2; ++side) {
     const int* const which = place.data + (2 * pair + side) * WHICH;
-    const REAL *const value = sides.data + (2 * pair + side) * SIDE, *const pose = own + 7 * which[0];
-    solids::Solid& solid = both[side];
-    turned::middle(which[0] < 0 ? nullptr : pose, value, solid.at);
-    if (side == 0)
-        for (int c = 0; c < 3; ++c) origin[c] = solid.at[c];
-    for (int c = 0; c < 3; ++c) {
-        solid.at[c] -= origin[c];  // points from the first shape, whose small numbers have small errors
-        solid.size[c] = value[7 + c];
-        REAL axis[3] = {(REAL)(c == 0), (REAL)(c == 1), (REAL)(c == 2)}, turn[3];
-        turned::by(value + 3, axis, turn);
-        if (which[0] >= 0) {
-            for (int r = 0; r < 3; ++r) axis[r] = turn[r];
-            turned::by(pose + 3, axis, turn);
-        }
-        for (int r = 0; r < 3; ++r) solid.turn[3 * r + c] = turn[r];
+    const REAL* const value = sides.data + (2 * pair + side) * SIDE;
+    const REAL* const pose = which[0] < 0 ? nullptr : own + 7 * which[0];
+    const int* const row = shape_rows.data + ROW * which[1];
+    const REAL* const size = sizes.data + SIZES * which[1];
+    shape[side] = {row[0], row[1], row[2], row[3], row[4], {size[0], size[1], size[2]}, size[3]};
+    turned::middle(pose, value, at[side]);
+    const REAL* const b = value + 3;
+    REAL q[4] = {b[0], b[1], b[2], b[3]};
+    if (pose) {
+        const REAL* const a = pose + 3;
+        q[0] = a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1];
+        q[1] = a[3] * b[1] + a[1] * b[3] + a[2] * b[0] - a[0] * b[2];
+        q[2] = a[3] * b[2] + a[2] * b[3] + a[0] * b[1] - a[1] * b[0];
+        q[3] = a[3] * b[3] - a[0] * b[0] - a[1] * b[1] - a[2] * b[2];
     }
-    solid.radius = value[10];
-    solid.box = which[1];
-    HULLS solid.hull = which[2];
+    convex::rotation(q, turn[side]);
 }
-REAL* const to = touches.data + (world * NEAR + k) * (MOST * POINT);
-const int found = solids::touch(both[0], both[1], to, 1, 0);
-for (int i = 0; i < found; ++i)
-    for (int c = 0; c < 3; ++c) to[POINT * i + c] += origin[c];
-list[1 + NEAR + k] = found;
+const REAL* const rates = velocities.data + world * velocities.shape[1] * 6;
+list[1 + NEAR + k] = convex::collide(shape[0], shape[1], tables, at[0], turn[0], at[1], turn[1],
+    turned::reach(rates, place.data, sides.data, pair, slack, h), touches.data + (world * NEAR + k) * (MOST * POINT));
 """
 
 
 def _text(body: str, pairs: int, near: int, T: type) -> str:
-    sizes = {"PAIRS": pairs, "NEAR": near, "SIDE": len(SIDE), "WHICH": len(WHICH), "MOST": MOST, "POINT": POINT}
+    sizes = {
+        "PAIRS": pairs, "NEAR": near, "SIDE": len(SIDE), "ARM": SIDE.index("arm"), "BOX": SIDE.index("size_x"),
+        "WHICH": len(WHICH), "MOST": MOST,
+        "POINT": POINT, "ROW": convex_pairs.ROW, "SIZES": convex_pairs.SIZES,
+    }  # fmt: skip
     constants = f"enum {{ {', '.join(f'{name} = {x}' for name, x in sizes.items())} }};\n"
     return constants + (TURN + body).replace("REAL", C_TYPE[T])
 
 
 @functools.cache
 def broad(pairs: int, near: int, T: type) -> wp.Kernel:
-    """List the pairs whose balls come nearer than ``margin``; LANES threads a world on CUDA, one on the CPU."""
-    arrays = [("poses", 3), ("place", 1), ("sides", 1), ("margin", 0), ("near", 1)]
+    """List the pairs that are near each other; LANES threads a world on CUDA, one on the CPU."""
+    arrays = [
+        ("poses", 3), ("velocities", 3), ("place", 1), ("sides", 1), ("slack", 0), ("h", 0), ("near", 1),
+    ]  # fmt: skip
     return native.kernel("broad_phase", _text(BROAD, pairs, near, T), arrays, T)
 
 
 @functools.cache
-def narrow(pairs: int, near: int, T: type, hulls: tuple[Any, ...] = (), long: bool = False, faces: bool = False):
-    """Find the points of the pairs that are listed; ``near`` threads a world, worlds side by side."""
-    arrays = [("poses", 3), ("place", 1), ("sides", 1), ("near", 1), ("touches", 2)]
-    body = narrow_phase.hulls.lines(NARROW, bool(hulls))
-    solids = NATIVE[C_TYPE[T]] + narrow_phase.native(T, hulls, long, faces)
-    return native.kernel("narrow_phase", solids + _text(body, pairs, near, T), arrays, T)
+def narrow(pairs: int, near: int, T: type, routines: tuple[str, ...]) -> wp.Kernel:
+    """Find the points of the pairs that are listed; ``near`` threads a world, worlds side by side.
+
+    ``routines``: of :data:`.convex_pairs.ROUTINES` those that the pairs need. Shapes are as there.
+    """
+    arrays = [
+        ("poses", 3), ("velocities", 3), ("place", 1), ("sides", 1), ("slack", 0), ("h", 0), ("shape_rows", 1),
+        ("sizes", 2), ("corners", 1), ("planes", 1), ("face_starts", 1), ("face_corners", 1), ("near", 1),
+        ("touches", 2),
+    ]  # fmt: skip
+    text = convex_pairs.definition(T, routines) + _text(NARROW, pairs, near, T)
+    return native.kernel("narrow_phase", text, arrays, T)

@@ -102,7 +102,10 @@ _ADVICE = {
         "span many turns or places lie 100 m from the origin."
     ),
     Status.CONTACT: "Use a shorter dt or more passes, or lower the contact's stiffness.",
-    Status.SLOTS: "Build the scene with more contact slots.",
+    Status.SLOTS: (
+        "Build the scene with more contact slots. Pairs of bodies have slots by their number and their shapes, see "
+        "Dynamics.explain(): fewer points that touch at once need fewer, such as of spheres and capsules for hulls."
+    ),
     Status.UNSUPPORTED: "Take contacts of this kind out of the model, or give them shapes that the solver supports. "
     "For contacts between bodies list pairs: SolverSPO(model, pairs=...), or spo.Contact(..., other=...) in a scene.",
     Status.QUATERNION: (

@@ -1,6 +1,7 @@
 """Bodies that touch, solved in joint space: the passes beside the dense ones, slots, and text that does not grow."""
 
 import functools
+import itertools
 import re
 
 import numpy as np
@@ -9,12 +10,16 @@ import warp as wp
 
 import warp_spo as spo
 from support import pair_scenes
-from support.pair_scenes import H, box, cube, free, mixed, mixed_states
+from support.hull_scenes import RAMP
+from support.pair_motions import momentum
+from support.pair_scenes import H, box, cube, cubes_in_a_row, free, hand, hand_states, mixed, mixed_states, shelf
+from support.pair_steps import StepAtPoints, points_of
+from warp_spo.dynamics.stepping import joint_space as choice
 from warp_spo.dynamics.stepping.joint_space import JointSpaceStep
-from warp_spo.errors import UnsupportedError
 from warp_spo.examples import grasp
+from warp_spo.execution.joint_tables import lacking
 from warp_spo.kernels import joint_space
-from warp_spo.reference.body_contact import PairStep
+from warp_spo.recursions.contact import joint_system
 
 EXACT = 1e-10  # of velocities over the largest one and of forces over the largest one, in float64; 1e-12 measured
 FOLLOWED = 1e-9  # of velocities and coordinates after 25 steps; see EXACT, and what steps make of it
@@ -22,25 +27,9 @@ FLOAT32 = 1e-4  # the same of velocities in float32, of the whole step with its 
 REFINED = 3e-5  # of the passes alone in float32, from the same masses, poses and points; 1e-5 measured
 
 
-def without_ground(scene):
-    """The pairs of ``mixed``, whose partners bring their own shapes."""
-    contacts = [c for c in scene.contacts if c.other is not None]
-    own = box(2, 0.06)
-    found = []
-    for c in contacts:
-        given = {name: getattr(c, name) for name in ("stiffness", "damping", "friction", "eps")}
-        name = next(
-            name for name in ("point", "sphere", "capsule", "box", "hull") if getattr(c, name, None) is not None
-        )
-        other = own if isinstance(c.other, int) else c.other
-        found.append(spo.Contact(c.body, **{name: getattr(c, name)}, other=other, **given))
-    return scene.with_contacts(found)
-
-
 def pinch(worlds=4):
-    """A Panda that presses a cube with 40 N; the cube's ground is left out."""
-    scene = grasp.scene()
-    scene, rng = scene.with_contacts(scene.contacts[1:]), np.random.default_rng(0)
+    """A Panda that presses a cube with 40 N."""
+    scene, rng = grasp.scene(), np.random.default_rng(0)
     q = np.tile(scene.neutral_q, (worlds, 1))
     q[:, :7] = [0.0, 0.55, 0.0, -2.13, 0.0, 2.69, 0.785] + 0.1 * rng.normal(size=(worlds, 7))
     q[:, 7:9] = grasp.CUBE - 1e-4
@@ -51,11 +40,17 @@ def pinch(worlds=4):
 
 
 def arms(worlds=4):
-    scene, (q, qd) = without_ground(mixed()), mixed_states(0, worlds)
-    return scene, q, qd, np.zeros_like(qd)
+    """Every kind of pair, drives with limits, the ground."""
+    q, qd = mixed_states(0, worlds)
+    return mixed(), q, qd, np.zeros_like(qd)
 
 
-CASES = {"pinch": pinch, "arms": arms}
+def fingers(worlds=4):
+    q, qd = hand_states(0, worlds)
+    return hand(), q, qd, np.zeros_like(qd)
+
+
+CASES = {"pinch": pinch, "arms": arms, "fingers": fingers}
 
 
 @functools.cache
@@ -78,16 +73,20 @@ def stepped(solver, q, qd, tau, passes=4):
 def test_passes_are_the_dense_ones(device, name):
     solver, (q, qd, tau) = made(name, 4, str(device), "float64")
     for passes in (1, 3, 4):
+        touching = 0
         v, forces, excess = stepped(solver, q, qd, tau, passes)
-        assert (solver.status.numpy() == 0).all()
+        assert np.isin(solver.status.numpy(), [spo.Status.OK, spo.Status.CONTACT]).all()
         for w in range(len(q)):
-            at = PairStep(solver.dyn.scene, q[w], qd[w], H)
-            wanted = at.run(tau[w], passes=passes)[1]
-            most = np.abs(wanted.f).max()
-            assert wanted.on.any() and most > 1.0
+            at = StepAtPoints(points_of(solver, w), solver.dyn.scene, q[w], qd[w], H)
+            wanted, points = at.run(tau[w], passes=passes)[1], len(solver.dyn.scene.contact_points)
+            most = max(1.0, np.abs(wanted.f).max())
+            touching += wanted.on.any()
             np.testing.assert_allclose(v[w], wanted.v, atol=EXACT * np.abs(wanted.v).max())
-            np.testing.assert_allclose(forces[w], at.reports(wanted)[0], atol=EXACT * most)
+            np.testing.assert_allclose(forces[w, points:], at.reports(wanted)[0], atol=EXACT * most)
+            pushed = [np.sum(wanted.f[: len(at.numbers)][np.equal(at.numbers, i)], axis=0) for i in range(points)]
+            np.testing.assert_allclose(forces[w, :points], np.reshape(pushed, (-1, 3)), atol=EXACT * most)
             np.testing.assert_allclose(excess[w], wanted.excess, atol=EXACT * most)
+        assert touching >= 3
 
 
 @pytest.mark.slow
@@ -98,7 +97,8 @@ def test_fingers_that_slide_pull_a_cube_as_the_dense_steps_do(device):
     for _ in range(25):
         qd = stepped(solver, q, qd, tau)[0].copy()
         q = solver.dyn.integrate(q, qd, H)
-        dense_q, found = PairStep(scene, dense_q, dense_v, H).run(tau[0], passes=4)
+        found = StepAtPoints(points_of(solver, 0), scene, dense_q, dense_v, H)
+        dense_q, found = found.run(tau[0], passes=4)
         dense_v = found.v
     assert np.abs(dense_v[:7]).max() > 0.5
     np.testing.assert_allclose(qd[0], dense_v, atol=FOLLOWED * np.abs(dense_v).max())
@@ -113,7 +113,7 @@ def test_float32_is_refined(device):
     wanted = stepped(exact, q, qd, tau)[0]
     size = np.abs(wanted).max(axis=1, keepdims=True)
     assert (np.abs(v - wanted) < FLOAT32 * size).all()
-    for name in ("mass", "bias", "poses", "touches"):
+    for name in ("mass", "bias", "poses", "touches", "surfaces"):
         setattr(exact, name, wp.array(getattr(solver, name).numpy(), dtype=wp.float64, device=device))
     exact.near = solver.near
     given = [wp.array(x, dtype=wp.float64, device=device) for x in (q, qd, tau)]
@@ -147,7 +147,7 @@ def test_the_deepest_points_stay(device):
     solver = JointSpaceStep(spo.Dynamics(scene, 2, device, "float64"), near=1, slots=2)
     given = [wp.array(x, dtype=wp.float64, device=device) for x in (q, np.zeros((2, 12)), np.zeros((2, 12)))]
     solver.step(*given, (given[0], None), H, passes=1)
-    assert (solver.status.numpy() == spo.Status.SLOTS).all() and joint_space.SLOTS == spo.Status.SLOTS
+    assert (solver.status.numpy() == spo.Status.SLOTS).all()
     depth = solver.touches.numpy().reshape(2, 8, 7)[:, :4, 6]
     kept = np.sort(depth, axis=1)[:, 2:]
     # one pass, no velocity: both points together lift the cube by k p / 4 each, less what the dampers take
@@ -167,31 +167,173 @@ def test_the_text_does_not_grow_with_pairs(monkeypatch):
     assert re.sub(r"\d+", "0", texts[0]) == re.sub(r"\d+", "0", texts[1])
 
 
-def test_hinges_without_an_axis_are_refused():
+def test_words_are_those_of_the_package():
+    words = {"CROWDED": spo.Status.SLOTS} | {name: spo.Status[name] for name in ("PIVOT", "NOT_FINITE", "CONTACT")}
+    assert words == joint_space.WORDS and joint_system.SURFACE == joint_space.SURFACE
+
+
+def row(count=7):
+    """Cubes side by side on a table, between two that fly towards each other; each may touch each."""
+    scene, q, qd = cubes_in_a_row(count)
+    half, law = 0.05, dict(stiffness=1e5, damping=50.0)
+    table = spo.Contact(-1, box=((4.0, 4.0, 0.1), (0, 0, -0.15, 0, 0, 0, 1)))
+    contacts = [box(i, half, other=box(j, half), **law) for i, j in itertools.combinations(range(count), 2)]
+    contacts += [box(i, half, other=table, friction=0.4) for i in range(count)]
+    heavy = spo.Scene(scene.bodies, scene.hinges, contacts=contacts, gravity=(0.0, 0.0, -9.81))
+    return heavy, q - 1e-4 * (np.arange(7 * count) % 7 == 2), qd
+
+
+@functools.cache
+def row_step(device, dtype, **options):
+    scene, q, qd = row()
+    dyn = spo.Dynamics(scene, 2, device, dtype, **options)
+    return dyn, q, qd
+
+
+def test_users_get_it_where_many_links_are_tied(device):
+    """A step of a scene with many pairs, with all reports, beside the dense one at the same points."""
+    dyn, q, qd = row_step(str(device), "float64")
+    found, dense = pair_scenes.stepped(dyn, q, qd), []
+    for w in range(2):
+        at = StepAtPoints(points_of(dyn._joint_space, w), dyn.scene, q[w], qd[w], H)
+        after, wanted = at.run(passes=4)
+        f, gap, slip = at.reports(wanted)
+        np.testing.assert_allclose(found["q"][w], after, atol=EXACT)
+        np.testing.assert_allclose(found["qd"][w], wanted.v, atol=EXACT)
+        np.testing.assert_allclose(found["contact_f"][w], f, atol=EXACT * np.abs(wanted.f).max())
+        np.testing.assert_allclose(found["contact_gap"][w], gap, atol=EXACT)
+        np.testing.assert_allclose(found["contact_slip"][w], slip, atol=EXACT)
+        np.testing.assert_allclose(found["contact_excess"][w], wanted.excess, atol=EXACT * np.abs(wanted.f).max())
+        dense.append(wanted.on.sum())
+    assert min(dense) >= 28 and (found["status"] == spo.Status.OK).all()
+    line = next(line for line in dyn.explain().splitlines() if line.startswith("contacts"))
+    assert "16 of 28 pairs may be near each other in a world, and 64 points of them have slots" in line
+
+
+def test_small_scenes_keep_generated_code():
+    dyn = spo.Dynamics(mixed(), 2, "cpu")
+    assert dyn._joint_space is None
+    assert "pairs of bodies by generated code: few links are tied" in dyn.explain()
+
+
+def test_each_world_has_values_of_its_own(device):
+    """Friction, stiffness, masses, gravity, drives and limits, and targets, loads and wrenches."""
+    scene, worlds = mixed(), 3
+    names = ("contact_friction", "contact_stiffness", "gravity", "joint_target_ke", "joint_limit_lower",
+             "joint_effort_limit", "joint_velocity_limit", "joint_damping")  # fmt: skip
+    dyn, rng = spo.Dynamics(scene, worlds, device, "float64", variable=names), np.random.default_rng(1)
+    dyn._joint_space = choice.JointSpaceStep(dyn)
+    values = {
+        name: scene.values[name] * rng.uniform(0.5, 1.5, (worlds, *scene.values[name].shape[1:])) for name in names
+    }
+    values["joint_limit_lower"][:, 0], values["joint_velocity_limit"][:, 1] = 0.3, 0.1
+    dyn.set(**values)
+    q, qd = mixed_states(0, worlds)
+    shapes = dict(tau=qd.shape[1:], body_f=(6, 6), target_q=q.shape[1:], target_qd=qd.shape[1:])
+    given = {name: 3.0 * rng.normal(size=(worlds, *shape)) for name, shape in shapes.items()}
+    report = spo.StepReport(qdd=np.zeros_like(qd))
+    after, rates = dyn.step(q, qd, dt=H, report=report, **given)
+    for w in range(worlds):
+        own = scene.with_values(**{name: value[w] for name, value in values.items()})
+        at = StepAtPoints(
+            points_of(dyn._joint_space, w), own, q[w], qd[w], H, given["target_q"][w], given["target_qd"][w]
+        )
+        at.neutral = StepAtPoints({}, scene, q[w], qd[w], H).neutral
+        wanted_q, wanted = at.run(given["tau"][w], given["body_f"][w], passes=4)
+        np.testing.assert_allclose(rates[w], wanted.v, atol=EXACT * np.abs(wanted.v).max())
+        np.testing.assert_allclose(after[w], wanted_q, atol=EXACT)
+        np.testing.assert_allclose(report.qdd[w], (wanted.v - qd[w]) / H, atol=1e3 * EXACT * np.abs(wanted.v).max())
+
+
+def test_substeps_are_calls(device):
+    """To the bit, with the mean force and the worst status."""
+    dyn, q, qd = row_step(str(device), "float64")
+    force = dyn.step_report("contact_f", like=q)
+    state, mean = (q, qd), 0.0
+    for _ in range(3):
+        state = dyn.step(*state, None, H, report=force)
+        mean = mean + force.contact_f / 3.0
+    status = np.zeros(2, np.int32)
+    found = dyn.step(q, qd, None, H, options=spo.StepOptions(substeps=3), report=force, status=status)
+    for one, other in zip(found, state, strict=True):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_allclose(force.contact_f, mean, rtol=1e-12, atol=1e-12)
+    for _ in range(3):  # recorded, and in place
+        again = dyn.step(q, qd, None, H, options=spo.StepOptions(substeps=3))
+    np.testing.assert_array_equal(again[1], found[1])
+
+
+def test_nan_stays_in_its_world(device):
+    dyn, q, qd = row_step(str(device), "float64")
+    clean, bad = pair_scenes.stepped(dyn, q, qd), q.copy()
+    bad[0, 4] = np.nan
+    found = pair_scenes.stepped(dyn, bad, qd)
+    assert found["status"].tolist() == [spo.Status.NOT_FINITE, spo.Status.OK]
+    for name in ("q", "qd", "contact_f", "contact_gap"):
+        np.testing.assert_array_equal(found[name][1], clean[name][1])
+
+
+def test_near_pairs_are_chosen_by_boxes(device):
+    """A table reaches far beyond each cube; those on it are in the list with it, and those above it are not."""
+    dyn, q, qd = row_step(str(device), "float64")
+    lifted = q.copy()
+    lifted[1, 2::7] += 0.1
+    dyn.step(lifted, qd, None, H)
+    solver, cubes = dyn._joint_space, 7
+    found = solver.near.numpy().reshape(2, -1)[:, 0]
+    assert found.tolist() == [cubes - 1 + cubes, cubes - 1]
+
+
+@pytest.mark.parametrize("shape", [dict(box=(0.1, 0.1, 0.1)), dict(hull=RAMP / 8.0)], ids=["boxes", "hulls"])
+def test_bodies_that_are_thrown_at_each_other_gain_nothing(device, shape):
+    """Two that spin meet anyhow, without gravity: by edges, corners and faces; momenta stay.
+
+    With points from common parts of faces alone, some of these gain half of their energy.
+    """
+    rng, worlds, law = np.random.default_rng(1), 100, dict(stiffness=1e5, friction=0.5)
+    scene = free([cube(1.0, 0.1), cube(1.5, 0.1)], [spo.Contact(0, **shape, other=spo.Contact(1, **shape), **law)])
+    q, qd = np.zeros((worlds, 14)), 0.5 * rng.normal(size=(worlds, 12))
+    q[:, 3:7], q[:, 10:] = rng.normal(size=(worlds, 4)), rng.normal(size=(worlds, 4))
+    for turn in (q[:, 3:7], q[:, 10:]):
+        turn /= np.linalg.norm(turn, axis=1)[:, None]
+    way = rng.normal(size=(worlds, 3))
+    way /= np.linalg.norm(way, axis=1)[:, None]
+    q[:, 7:10], qd[:, 6:9] = 0.45 * way, -2.0 * way
+    dyn = spo.Dynamics(scene, worlds, device, "float64")
+    dyn._joint_space = choice.JointSpaceStep(dyn)
+    before, first, most, met = momentum(scene, q, qd), dyn.kinetic_energy(q, qd), 0.0, np.zeros(worlds, bool)
+    force = dyn.step_report("contact_f", like=q)
+    for _ in range(80):
+        q, qd = dyn.step(q, qd, None, H, report=force)
+        most, met = max(most, (dyn.kinetic_energy(q, qd) / first).max()), met | force.contact_f.any(axis=(1, 2))
+    assert met.sum() >= 80 and most < 1.0 + 1e-12
+    np.testing.assert_allclose(momentum(scene, q, qd), before, atol=1e-11)
+
+
+@pytest.mark.parametrize("speed", [2.0, 40.0, 400.0])
+def test_a_fast_ball_is_not_missed(device, speed):
+    """The ball is in the wall's reach in the step that would carry it into the wall, however fast it comes."""
+    wall = spo.Contact(-1, box=((0.02, 1.0, 1.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)))
+    scene = free([cube(1.0, 0.05)], [spo.Contact(0, sphere=0.05, other=wall, stiffness=1e5, damping=0.0)])
+    dyn = spo.Dynamics(scene, 1, device, "float64")
+    solver = choice.JointSpaceStep(dyn)
+    q, qd = np.zeros((1, 7)), np.zeros((1, 6))
+    q[:, 6], qd[:, 0] = 1.0, -speed
+    q[:, 0] = 0.07 + 0.9 * speed * H
+    given = [wp.array(x, dtype=wp.float64, device=device) for x in (q, qd)]
+    v = solver.step(*given, None, (None, None), H).numpy()[0, 0]
+    k, depth = 1e5, -0.9 * speed * H  # m v' = m v + h k (depth - h v')
+    assert v == pytest.approx((-speed + H * k * depth) / (1.0 + H * H * k), rel=1e-12)
+    assert abs(v) < speed
+
+
+def test_what_it_does_not_take_has_words():
+    """And such scenes keep generated code."""
     scene = grasp.scene()
     hinges = [*scene.hinges[:-1], spo.Hinge("universal", -1, scene.hinge_of[-1], axis=((1, 0, 0), (0, 1, 0)))]
     other = spo.Scene(scene.bodies, hinges, contacts=scene.contacts[1:])
-    with pytest.raises(UnsupportedError, match="universal hinges where bodies touch in joint space"):
-        JointSpaceStep(spo.Dynamics(other, 1, "cpu"))
-
-
-def test_a_step_of_dynamics_reports_the_same(device):
-    """The step with all reports, of a Dynamics that solves its pairs in joint space."""
-    solver, (q, qd, _) = made("arms", 4, str(device), "float64")
-    dyn = solver.dyn
-    try:
-        dyn._joint_space = solver
-        found = pair_scenes.stepped(dyn, q, qd)
-    finally:
-        dyn._joint_space = None
-    for w in range(4):
-        at = PairStep(dyn.scene, q[w], qd[w], H)
-        after, wanted = at.run(passes=4)
-        f, gap, slip = at.reports(wanted)
-        near = found["contact_gap"][w] < joint_space.AWAY
-        assert near.sum() >= 2 and (gap[~near] > 0.0).all()
-        np.testing.assert_allclose(found["q"][w], after, atol=EXACT)
-        np.testing.assert_allclose(found["contact_f"][w], f, atol=EXACT * np.abs(wanted.f).max())
-        np.testing.assert_allclose(found["contact_gap"][w, near], gap[near], atol=EXACT)
-        np.testing.assert_allclose(found["contact_slip"][w, near], slip[near], atol=EXACT)
-        assert found["status"][w] == spo.Status.OK
+    assert lacking(other, ()) == "universal hinges"
+    assert lacking(scene, ("joint_X_p",)) == "joint_X_p that varies between worlds"
+    flat = scene.with_contacts([spo.Contact(0, box=(0.1, 0.1, 0.0), other=box(1, 0.1))])
+    assert lacking(flat, ()) == "boxes without thickness"
+    assert lacking(shelf(-1), ()) == "" and lacking(scene, ("contact_friction",)) == ""

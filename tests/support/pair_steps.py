@@ -10,6 +10,30 @@ from warp_spo.reference.body_contact import PairStep
 
 from .pair_scenes import H, stepped
 
+
+def points_of(solver, world):
+    """Return the points that the solver in joint space has found in a world, by number of the pair."""
+    near = solver.near.numpy().reshape(solver.worlds, -1)[world]
+    most, found = solver.near_count, {}
+    touches = solver.touches.numpy().reshape(solver.worlds, most, 8, 7)[world]
+    for k in range(min(near[0], most)):
+        if near[1 + k] >= 0:
+            rows = touches[k, : near[1 + most + k]].astype(np.float64)
+            found[solver.tables.pairs[near[1 + k]]] = [(row[:3], row[3:6], row[6]) for row in rows]
+    return found
+
+
+class StepAtPoints(PairStep):
+    """A dense step whose pairs share points that were found elsewhere, by number of the pair."""
+
+    def __init__(self, found, *args, **options):
+        self.found = found
+        super().__init__(*args, **options)
+
+    def points_of(self, number, first, second):
+        return self.found.get(number, [])
+
+
 TOLERANCE = {"float64": (1e-10, 1e-9), "float32": (1e-4, 1e-3)}
 """Of velocities, over the largest one, and of forces, over the largest one; 4e-13 and 3e-12, 2e-5 and 2e-4 measured."""
 

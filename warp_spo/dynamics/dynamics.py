@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -57,9 +57,7 @@ from .operation import Operation, declared
 from .refinement import Refinement
 from .stepping import contact_options
 from .stepping import step as steps
-
-if TYPE_CHECKING:
-    from .stepping.joint_space import JointSpaceStep
+from .stepping.joint_space import JointSpaceStep, choose_solver
 
 MOST_WORLDS = 2**31 - 1  # of an axis of a Warp array
 
@@ -259,7 +257,6 @@ class Dynamics:
             raise UnsupportedError("Dynamics", f"refine={count} with loops={loops!r}", "dtype='float64'")
         self.refine = count
         self._refinement = Refinement(self, count) if count else None
-        self._joint_space: JointSpaceStep | None = None  # solves pairs of bodies in place of the sweep's kernels
         self._looks_at_targets = True  # at the first step that is given some: whether a drive follows them
         self._options = {
             "worlds": self.worlds,
@@ -332,6 +329,11 @@ class Dynamics:
     def operation_counts(self) -> dict[str, int]:
         """Floating-point operations of one world, of the operations that have a kernel of their own so far."""
         return self.programs.operation_counts
+
+    @functools.cached_property
+    def _joint_space(self) -> JointSpaceStep | None:
+        """What solves the pairs of bodies in joint space; None where there are none, or generated code solves them."""
+        return choose_solver(self)
 
     @functools.cached_property
     def _later_status(self) -> wp.array:

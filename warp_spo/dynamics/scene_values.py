@@ -231,3 +231,4 @@ def _rebuild(dyn: Dynamics, folded: dict[str, np.ndarray]) -> None:
     dyn._replays.forget()
     dyn._gradients.forget()
     dyn._refinement = Refinement(dyn, dyn.refine) if dyn.refine else None
+    vars(dyn).pop("_joint_space", None)  # made anew when a step needs it

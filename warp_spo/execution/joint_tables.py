@@ -6,15 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import UnsupportedError
-from ..kernels import joint_space, near_pairs
-from ..recursions.contact.couples import Polyhedron
+from ..kernels import joint_space
 from ..recursions.contact.pairs import inverse_weights
+from ..recursions.contact.points import inverse_weights as point_weights
 from ..recursions.step.joint_laws import DEFAULT_BOUND, HOLD, neutral_inertias
+from ..scene.contact_values import TURNING_VALUES
 from ..scene.parts import UNLIMITED
 from ..scene.scene import Scene
 
-MOST_DOFS = 100  # with those that fill limbs they are 128 at most, the bits of a mask of tiles
+MOST_PLACES = 256  # of dofs, each limb's even; tables hold a place in 8 bits
+HINGES = {"revolute", "prismatic", "helical", "fixed", "free", "ball"}
 NONE = 1e30  # a bound that no force or rate reaches
 SIGNS = {-1: 0, 0: 1, 1: 2}  # two bits of a column
 
@@ -24,49 +25,46 @@ class JointTables(NamedTuple):
 
     Attributes:
         sizes: of the system. place: integers, see :class:`~warp_spo.kernels.joint_space.Sizes`.
-        dof_values, pair_values: constants, flat. which, sides: of the shapes of pairs, flat.
-        hulls, long, faces: what the narrow phase needs to know of the shapes.
+        dof_values, pair_values: constants, flat. pairs: the order of the scene's pairs here.
     """
 
     sizes: joint_space.Sizes
     place: np.ndarray
     dof_values: np.ndarray
     pair_values: np.ndarray
-    which: np.ndarray
-    sides: np.ndarray
-    hulls: tuple[Polyhedron, ...]
-    long: bool
-    faces: bool
+    pairs: list[int]
 
 
-def joint_tables(scene: Scene, pattern: tuple[np.ndarray, np.ndarray], near: int, slots: int) -> JointTables:
+def joint_tables(
+    scene: Scene, pattern: tuple[np.ndarray, np.ndarray], near: int, slots: int, surfaces: list[range]
+) -> JointTables:
     """Return the tables of a scene whose packed mass matrix has rows and columns ``pattern``.
 
-    ``near``: pairs at most that are near in a world. ``slots``: points at most.
+    ``near``: pairs at most that are near in a world. ``slots``: points of pairs at most. ``surfaces``: of each point
+    with the ground, the numbers of the surfaces that it may touch.
     """
-    _refuse(scene)
-    dofs_of = [np.arange(scene.qd_start[h], scene.qd_start[h + 1]) for h in scene.hinge_of]
+    dofs_of = _dofs_by_body(scene)
     ways = _ways(scene)
     order = _order(scene, dofs_of, ways)
     position = {dof: i for i, dof in enumerate(order) if dof >= 0}
     tiles = len(order) // 2
-    if tiles > 64:
-        what = f"limbs with {len(order)} dofs, each limb's even, more than 128,"
-        raise UnsupportedError("Dynamics.step", f"{what} where bodies touch in joint space", "use another solver")
     couples, columns = _couples(scene, dofs_of, ways, position)
     pairs = sorted(range(len(scene.contact_pairs)), key=lambda i: (couples[_bodies(scene, i)], i))
     rows, cols = pattern
     sizes = joint_space.Sizes(
-        scene.dof_count, tiles, len(rows), len(pairs), len(couples), max(map(len, columns), default=0), near, slots
-    )
+        scene.dof_count, tiles, len(rows), len(pairs), len(couples), max(map(len, columns), default=0), near,
+        slots + sum(map(len, surfaces)), sum(map(len, surfaces)), len(surfaces),
+    )  # fmt: skip
     entries, masks = _entries(rows, cols, position, tiles)
     axis_body, point_body, coordinate, dof_values = _dofs(scene)
     table: list[int] = [*order, *entries]
-    table += [(mask >> shift) & 0xFFFFFFFF for mask in masks for shift in (0, 32)]
+    table += [(mask >> shift) & 0xFFFFFFFF for mask in masks for shift in range(0, 64 * sizes.words, 32)]
     for each in columns:
         table += [len(each), *each, *[0] * (sizes.columns - len(each))]
     for pair in pairs:
-        table += [couples[_bodies(scene, pair)], pair]
+        table += [couples[_bodies(scene, pair)], len(scene.contact_points) + pair]
+    numbers = [number for number, own in enumerate(surfaces) for _ in own]
+    table += [x for number in numbers for x in (couples[scene.contact_points[number].body, -1], number)]
     table += [*axis_body, *point_body, *coordinate]
     met: list[list[int]] = [[] for _ in order]  # entry and the other dof, of each dof
     for entry, both in enumerate(zip(rows.tolist(), cols.tolist(), strict=True)):
@@ -74,22 +72,45 @@ def joint_tables(scene: Scene, pattern: tuple[np.ndarray, np.ndarray], near: int
             met[position[i]].append(entry << 8 | position[j])
     table += [*np.cumsum([0, *map(len, met)]).tolist(), *(x for row in met for x in sorted(row))]
     assert len(table) == sizes.table_starts["END"]
-    which, sides, solids = _shapes(scene, pairs)
-    return JointTables(
-        sizes, np.array(table, dtype=np.int64).astype(np.uint32).view(np.int32), np.ravel(dof_values),
-        np.ravel(_pair_values(scene, pairs)), which, sides, *solids,
-    )  # fmt: skip
+    place = np.array(table, dtype=np.int64).astype(np.uint32).view(np.int32)
+    return JointTables(sizes, place, np.ravel(dof_values), _pair_values(scene, pairs, numbers), pairs)
 
 
-def _refuse(scene: Scene) -> None:
-    kinds = {hinge.kind for hinge in scene.hinges if hinge.dof_count > 1} - {"free", "ball"}
-    kinds |= {hinge.kind for hinge in scene.hinges if hinge.kind == "custom"}
-    lacks = [f"{kind} hinges" for kind in sorted(kinds)]
+def lacking(scene: Scene, variable: tuple[str, ...]) -> str:
+    """Return what of a scene the solver in joint space does not take, in words; "" if nothing."""
+    some: bool | np.bool
+    lacks = [f"{kind} hinges" for kind in sorted({hinge.kind for hinge in scene.hinges} - HINGES)]
     lacks += ["hinges that share dofs"] * bool(scene.shares_dofs)
     lacks += ["bodies with modes"] * any(body.modes is not None for body in scene.bodies)
-    lacks += [f"{scene.dof_count} dofs, more than {MOST_DOFS},"] * (scene.dof_count > MOST_DOFS)
-    if lacks:
-        raise UnsupportedError("Dynamics.step", f"{lacks[0]} where bodies touch in joint space", "use another solver")
+    lacks += ["actuators"] * bool(scene.actuators)
+    turns = [(hinge.kind in ("free", "ball"), dofs) for hinge, dofs in zip(scene.hinges, _dofs_of(scene), strict=True)]
+    for name in ("joint_stiffness", "joint_target_ke"):
+        some = name in variable or any(scene.values[name][:, dofs].any() for turn, dofs in turns if turn)
+        lacks += [f"{name} of ball and free hinges"] * (some and any(turn for turn, _ in turns))
+    for name in ("joint_X_p", "joint_X_c", "body_com"):
+        varies = name in variable or (scene.values[name] != scene.values[name][:1]).any()
+        lacks += [f"{name} that varies between worlds"] * bool(varies)
+    lacks += ["dofs without inertia"] * (not (neutral_inertias(scene) > 0.0).all())
+    count = len(scene.contact_points)
+    for name in TURNING_VALUES:
+        some = name in variable or scene.values[name][:, :count].any()
+        lacks += [name.removeprefix("contact_").replace("_", " ")] * bool(count and some)
+    lacks += ["boxes without thickness"] * any(
+        shape.has_faces and not (shape.size > 0.0).all() for pair in scene.contact_pairs for shape in pair.shapes
+    )
+    if not lacks and len(_order(scene, _dofs_by_body(scene), _ways(scene))) > MOST_PLACES:
+        lacks.append(f"{scene.dof_count} dofs")
+    return lacks[0] if lacks else ""
+
+
+def _dofs_of(scene: Scene) -> list[np.ndarray]:
+    """Return the dofs of each hinge."""
+    return [np.arange(a, b) for a, b in zip(scene.qd_start[:-1], scene.qd_start[1:], strict=True)]
+
+
+def _dofs_by_body(scene: Scene) -> list[np.ndarray]:
+    hinges = _dofs_of(scene)
+    return [hinges[hinge] for hinge in scene.hinge_of]
 
 
 def _ways(scene: Scene) -> list[list[int]]:
@@ -149,8 +170,8 @@ def _couples(
     """Return the number of each couple of bodies, and its columns: block, and which way each dof moves the first."""
     couples: dict[tuple[int, int], int] = {}
     columns = []
-    for pair in range(len(scene.contact_pairs)):
-        bodies = _bodies(scene, pair)
+    touching = [_bodies(scene, pair) for pair in range(len(scene.contact_pairs))]
+    for bodies in (*touching, *((point.body, -1) for point in scene.contact_points)):
         if bodies in couples:
             continue
         couples[bodies] = len(couples)
@@ -219,28 +240,12 @@ def _turned(q: np.ndarray, x: np.ndarray) -> np.ndarray:
     return np.asarray(x) + q[3] * t + np.cross(q[:3], t)
 
 
-def _pair_values(scene: Scene, pairs: list[int]) -> np.ndarray:
-    first = len(scene.contact_points)
+def _pair_values(scene: Scene, pairs: list[int], numbers: list[int]) -> np.ndarray:
+    """Return the constants of pairs, then of the points with these numbers, and half of gravity."""
+    first, points = len(scene.contact_points), scene.contact_points
     values = [scene.values[f"contact_{name}"][0] for name in ("stiffness", "damping", "friction")]
-    weights = inverse_weights(scene)
-    return np.array([[*(x[first + i] for x in values), scene.contact_pairs[i].eps, weights[i]] for i in pairs])
-
-
-def _shapes(scene: Scene, pairs: list[int]) -> tuple[np.ndarray, np.ndarray, tuple]:
-    """Return integers and constants of the shapes of the pairs, and what the narrow phase needs to know of them."""
-    which, sides, hulls, long, faces = [], [], {}, False, False  # type: ignore[var-annotated]
-    for number in pairs:
-        pair = scene.contact_pairs[number]
-        for body, shape in zip((pair.body, pair.other), pair.shapes, strict=True):
-            hull = -1
-            if shape.hull is not None:
-                hull = hulls.setdefault(Polyhedron(shape.hull.planes, shape.hull.edges), len(hulls))
-            which.append([body, int(shape.has_faces), hull])
-            ball = float(np.linalg.norm(shape.size)) + shape.radius
-            sides.append([*shape.pose, *shape.size, shape.radius, ball])
-        a, b = pair.shapes
-        faces |= a.hull is not None and b.hull is not None
-        sticks = [one for one in (a, b) if not one.has_faces]
-        long |= len(sticks) == 1 and sticks[0].size[2] > 0.0
-    assert not sides or len(sides[0]) == len(near_pairs.SIDE)
-    return np.ravel(which).astype(np.int32), np.ravel(sides), (tuple(hulls), long, faces)
+    weights = inverse_weights(scene) if pairs else []
+    rows = [[*(x[first + i] for x in values), scene.contact_pairs[i].eps, weights[i]] for i in pairs]
+    of_points = point_weights(scene) if numbers else []
+    rows += [[*(x[i] for x in values), points[i].eps, of_points[i]] for i in numbers]
+    return np.append(np.ravel(rows), 0.5 * np.linalg.norm(scene.values["gravity"][0]))

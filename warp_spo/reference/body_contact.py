@@ -30,7 +30,7 @@ class PairStep(ContactStep):
             at = len(scene.contact_points) + number
             k, d, mu = (dense.value(f"contact_{name}")[at] for name in ("stiffness", "damping", "friction"))
             places = [dense.body_matrix[body] if body >= 0 else np.eye(4) for body in (pair.body, pair.other)]
-            touched = touches(*(place(shape, body) for shape, body in zip(pair.shapes, places, strict=True)))
+            touched = self.points_of(number, *map(place, pair.shapes, places))
             for point, normal, depth in touched:
                 J = dense._jacobian_at(pair.body, point)[:3]
                 J = J - dense._jacobian_at(pair.other, point)[:3] if pair.other >= 0 else J
@@ -42,6 +42,10 @@ class PairStep(ContactStep):
         found = Points(*(np.reshape([row[i] for row in rows], s) for i, s in enumerate(shapes)), np.zeros(len(rows)))
         found = found.that_turn_freely()
         return found if ground is None else Points(*(np.concatenate(both) for both in zip(ground, found, strict=True)))
+
+    def points_of(self, number, first, second):
+        """Return the points that the two placed shapes of a pair share."""
+        return touches(first, second)
 
     def reports(self, found):
         """Return the force on the first body of each pair [pair, 3], and gap and slip of its deepest point [pair]."""

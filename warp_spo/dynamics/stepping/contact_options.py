@@ -18,6 +18,7 @@ from ...scene.ground import HeightField
 from ..closures import AMID_CONTACTS
 from ..operation import Argument
 from . import integrators
+from .joint_space import NO_ROOM, reason_against
 
 if TYPE_CHECKING:
     from ..dynamics import Dynamics
@@ -89,7 +90,8 @@ def refuse(dyn: Dynamics, call: Call, integrator: str) -> None:
         raise UnsupportedError(call.name, "closing loops in a scene with contacts", AMID_CONTACTS)
     if forced == "node":
         raise UnsupportedError(call.name, f"granularity={forced!r} with contacts", "use another one, or leave it out")
-    if forced == "segment" and dyn.scene.contact_pairs and not by_limbs(dyn.scene):
+    apart = bool(dyn.scene.contact_pairs) and dyn._joint_space is None  # no solver of its own, whatever the granularity
+    if forced == "segment" and apart and not by_limbs(dyn.scene):
         what = "granularity='segment' where pairs of bodies are not all on limbs of one link, or more than eight"
         raise UnsupportedError(call.name, what, "leave it out")
     if isinstance(dyn.scene.ground, HeightField) and dyn.scene.ground.heights.size >= MOST_HEIGHTS[dyn.dtype.__name__]:
@@ -109,10 +111,14 @@ def explain(dyn: Dynamics) -> str:
     figures = contact_figures(dyn.scene)
     if not dyn.scene.contacts:
         return figures
+    passes = f"{default_passes(dyn.scene)} passes of a step unless StepOptions(passes=) says otherwise, none at node"
+    if dyn._joint_space is not None:
+        return f"{figures}; {passes}; {dyn._joint_space.explain()}"
     routine = integrators.contact_routine(dyn)
     form = "a thread computes a whole world"
     if dyn.plan.of(routine) == "segment" and routine.divides(dyn.scene, ()):
         held = dyn.programs.warps(routine) != 1  # 1: a kernel was built, and limbs found no room in it
         form = "a warp for each limb" if held else f"{form}: what limbs tell each other does not fit in shared memory"
-    passes = f"{default_passes(dyn.scene)} passes of a step unless StepOptions(passes=) says otherwise, none at node"
+    if dyn.scene.contact_pairs:
+        form += f"; pairs of bodies by generated code: {reason_against(dyn.scene, dyn.variable) or NO_ROOM}"
     return f"{figures}; {passes}; {form}"

@@ -3,49 +3,96 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import warp as wp
 
-from ...errors import UnsupportedError
-from ...execution.joint_tables import joint_tables
+from ...execution.joint_tables import joint_tables, lacking
 from ...execution.routine import Routine
-from ...kernels import joint_space, near_pairs
+from ...kernels import convex_pairs, joint_space, near_pairs
 from ...recursions import coordinates
-from ...recursions.contact.pairs import PASSES
+from ...recursions.contact import coupled, joint_system
+from ...recursions.contact.pairs import PASSES, RESIDUAL
+from ...recursions.contact.points import surface_numbers
+from ...recursions.contact.step import TOLERANCE
+from ...recursions.model.links import Links
 from ...runtime import launches
+from ...scene.contact_shapes import BOX, ConvexShape
+from ...scene.ground import HEIGHTS
+from ...scene.scene import Scene
+from ..convex_contacts import PairShape, rotated, shape_rows
 from ..inertia import MASS_MATRIX_PACKED
-from ..inverse_dynamics import BIAS_FORCE
-from ..kinematics import BODY_POSES
+from ..kinematics import BODY_STATES
 
 if TYPE_CHECKING:
-    from ...scene.scene import Scene
     from ..dynamics import Dynamics
 
 INTEGRATE = Routine("integrate", coordinates.integrate)
+SYSTEM = Routine("joint_system", joint_system.joint_system)
 FEW, MOST_SHARED = 8192, 96 * 1024
 """Worlds up to which each takes a warp; shared memory of a block above which it does, too [bytes]. Not measured yet."""
-MARGIN = 5e-3  # how near shapes and points must be to be looked at [m]
+ROOM = 227 * 1024  # shared memory of a block [bytes]
+MARGIN = 5e-3  # how near shapes are looked at whatever their speeds [m]; a drive at 1000 m/s^2 moves so far in 3 ms
+TINY = 1e-9  # radius of a point among shapes [m]
+NO_ROOM = "a world in joint space is larger than the shared memory of a block"
+NEAR, NEAR_A_BODY, FULL = 16, 2, 8
+"""Pairs that may be near in a world: so many, or so many for each body of a pair. Of FULL of them, or of as many as
+there are such bodies, all points have slots. In a pile a body lies on one or two others, mostly with four points."""
+
+
+def reason_against(scene: Scene, variable: tuple[str, ...]) -> str:
+    """Return why the pairs of a scene are not solved in joint space; "" if they are."""
+    if scene.dof_count == 0:
+        return "nothing can move"
+    if coupled.is_supported(Links(scene)):
+        return "few links are tied, and generated code eliminates them"
+    lacks = lacking(scene, variable)
+    return f"{lacks} have no solution in joint space" if lacks else ""
+
+
+def choose_solver(dyn: Dynamics) -> JointSpaceStep | None:
+    """Return the solver of the pairs of bodies; None where there are none, or generated code solves them."""
+    if not dyn.scene.contact_pairs or reason_against(dyn.scene, dyn.variable):
+        return None
+    solver = JointSpaceStep(dyn)
+    return solver if solver.fits else None
+
+
+def choose_slots(scene: Scene) -> tuple[int, int]:
+    """Return how many pairs may be near in a world, and how many of their points get slots."""
+    pairs = scene.contact_pairs
+    bodies = {body for pair in pairs for body in (pair.body, pair.other) if body >= 0}
+    points = sorted((_points(*pair.shapes) for pair in pairs), reverse=True)
+    return min(len(pairs), max(NEAR, NEAR_A_BODY * len(bodies))), sum(points[: max(FULL, len(bodies))])
+
+
+def _points(one: ConvexShape, other: ConvexShape) -> int:
+    """Return how many points two shapes share at most."""
+    round_ones = [not shape.has_faces and shape.size[2] == 0.0 for shape in (one, other)]
+    if any(round_ones):
+        return 1
+    return convex_pairs.POINTS if one.kind == other.kind == BOX else 4
 
 
 class JointSpaceStep:
-    """Steps of a Dynamics whose scene has pairs of bodies, and no contact with the ground.
+    """Steps of a Dynamics whose scene has pairs of bodies.
 
     Args:
-        dyn: of the scene; its worlds share the scene's values.
-        near: pairs of shapes at most that are near each other in a world. slots: points at most.
+        dyn: of the scene.
+        near: pairs of shapes at most that are near each other in a world. slots: points of these at most. None: as
+            :func:`choose_slots` says; fewer where shared memory is too small for a world.
         lanes: threads of a world on a GPU: 8, 16 or 32; None: by the number of worlds.
         registers: of a thread at most; None: as the compiler chooses.
-        margin: how near shapes and points must be to be looked at [m].
+        margin: how near shapes must be to be looked at where nothing moves [m].
         refine: steps of iterative refinement in the last pass; None: one in float32.
     """
 
     def __init__(
         self,
         dyn: Dynamics,
-        near: int = 16,
-        slots: int = 32,
+        near: int | None = None,
+        slots: int | None = None,
         lanes: int | None = None,
         registers: int | None = None,
         margin: float = MARGIN,
@@ -54,92 +101,156 @@ class JointSpaceStep:
         scene: Scene = dyn.scene
         T: Any = dyn.dtype
         self.dyn = dyn
-        self.near_count, self.margin, self.device, self.worlds = near, margin, dyn.device, dyn.worlds
+        self.margin, self.device, self.worlds = margin, dyn.device, dyn.worlds
+        chosen = choose_slots(scene)
+        self.near_count = near = chosen[0] if near is None else near
+        self.slot_count = slots = chosen[1] if slots is None else slots
         pattern = dyn.mass_matrix_pattern
-        self.tables = tables = joint_tables(scene, pattern, near, slots)
+        surfaces = surface_numbers(scene, HEIGHTS in dyn.variable)
+        tables = joint_tables(scene, pattern, near, slots, surfaces)
         sizes = tables.sizes
+        while self.device.is_cuda and slots > near and joint_space.world_bytes(sizes, T) > ROOM:
+            self.slot_count = slots = max(near, slots - 8)
+            sizes = sizes._replace(slots=slots + sizes.surfaces)
+        self.tables = tables = tables._replace(sizes=sizes)
         crowded = 2 * joint_space.world_bytes(sizes, T) > MOST_SHARED
         self.lanes = lanes or (32 if crowded or dyn.worlds <= FEW else 16)
         array: Any = functools.partial(wp.array, dtype=T, device=self.device)
-        self.place, self.which = array(tables.place, dtype=int), array(tables.which, dtype=int)
-        self.dof_values, self.pair_values = array(tables.dof_values), array(tables.pair_values)
-        self.sides = array(tables.sides)
         make = lambda *shape, dtype=T: wp.zeros(shape, dtype=dtype, device=self.device)  # noqa: E731
+        varies = any(self._varies(name) for name in (*joint_system.LAWS.values(), *joint_system.OTHERS))
+        rows = self.worlds if varies else 1
+        self.names = (joint_space.DOF_VALUES, joint_space.PAIR_VALUES) if varies else None
+        self.place = array(tables.place, dtype=int)
+        self.dof_values, self.pair_values = (
+            array(np.tile(values, (rows, 1))) for values in (tables.dof_values, tables.pair_values)
+        )
         self.near = make(self.worlds * (1 + 2 * near), dtype=int)
         self.touches = make(self.worlds, near * joint_space.MOST * joint_space.POINT)
-        n = scene.dof_count
+        self.surfaces = make(self.worlds, max(1, sizes.surfaces * joint_space.SURFACE))
+        n, contacts = scene.dof_count, scene.contact_count
         self.neutral = array(np.tile(scene.neutral_q, (self.worlds, 1)))
         self.mass, self.poses = make(self.worlds, len(pattern[0])), make(self.worlds, scene.body_count, 7)
+        self.velocities = make(self.worlds, scene.body_count, 6)
         self.bias, self.still = make(self.worlds, n), make(self.worlds, n)
-        self.qd_out, self.excess = make(self.worlds, n), make(self.worlds, 3)
-        self.contact_f, self.status = make(self.worlds, scene.contact_count, 3), make(self.worlds, dtype=int)
-        self.contact_gap, self.contact_slip = (make(self.worlds, scene.contact_count) for _ in range(2))
-        lift, mass = scene.values["body_gravcomp"][0], scene.values["body_mass"][0]
-        gravity = scene.values["gravity"][0]
-        self.lift: wp.array | None = None
-        if lift.any():
-            push = np.zeros((self.worlds, scene.body_count, 6))
-            push[..., :3] = -(lift * mass)[:, None] * gravity
-            self.lift = array(push)
-        self.half_gravity = 0.5 * float(np.linalg.norm(gravity))
+        self.qd_out, self.qdd, self.excess = make(self.worlds, n), make(self.worlds, n), make(self.worlds, 3)
+        self.contact_f, self.status = make(self.worlds, contacts, 3), make(self.worlds, dtype=int)
+        self.contact_gap, self.contact_slip = make(self.worlds, contacts), make(self.worlds, contacts)
+        gravity = float(np.linalg.norm(scene.values["gravity"], axis=1).max())
+        self.gravity = gravity
+        efforts = scene.values["joint_effort_limit"]
+        weight = float(scene.values["body_mass"].sum(axis=1).max()) * 9.81
+        effort = float(efforts[efforts > 0.0].min()) if (efforts > 0.0).any() else 1.0
+        self.tolerances = [TOLERANCE * weight, TOLERANCE * effort]
         self.solver = joint_space.solver(
             sizes, T, self.lanes, registers, int(T is wp.float32) if refine is None else refine
         )
+        self._make_shapes(array)
         self.broad = near_pairs.broad(sizes.pairs, near, T)
-        self.narrow = near_pairs.narrow(sizes.pairs, near, T, tables.hulls, tables.long, tables.faces)
+
+    def _varies(self, name: str) -> bool:
+        values = self.dyn.scene.values[name]
+        return name in self.dyn.variable or bool((values != values[:1]).any())
+
+    def _make_shapes(self, array: Any) -> None:
+        """Make what the phases read of the shapes of the pairs."""
+        scene, T = self.dyn.scene, cast(Any, self.dyn.dtype)
+        pairs = [scene.contact_pairs[i] for i in self.tables.pairs]
+        numbers: dict[int, int] = {}
+        shapes: list[PairShape] = []
+        sides, which = [], []
+        for pair in pairs:
+            for shape in pair.shapes:
+                if id(shape) not in numbers:
+                    numbers[id(shape)] = len(shapes)
+                    shapes.append(_pair_shape(shape))
+        rows = shape_rows("Dynamics.step", shapes)
+        for pair in pairs:
+            for body, shape in zip((pair.body, pair.other), pair.shapes, strict=True):
+                row = numbers[id(shape)]
+                at = shape.pose[:3] + rotated(shape.pose[3:], rows.middles[row])
+                sizes = shape.size + shape.radius
+                ball = float(np.linalg.norm(shape.size)) + shape.radius
+                if shape.hull is not None:
+                    corners = shape.hull.corners - rows.middles[row]
+                    sizes, ball = np.abs(corners).max(axis=0), float(np.linalg.norm(corners, axis=1).max())
+                com = scene.values["body_com"][0, body] if body >= 0 else at
+                which.append([body, row])
+                sides.append([*at, *shape.pose[3:], *sizes, float(np.linalg.norm(at - com)) + ball, ball])
+        assert not sides or len(sides[0]) == len(near_pairs.SIDE)
+        self.which, self.sides = array(np.ravel(which), dtype=int), array(np.ravel(sides))
+        routines = rows.routines([which[i][1::2] + which[i + 1][1::2] for i in range(0, len(which), 2)])
+        kinds = [array(np.ravel(rows.rows), dtype=int), array(rows.sizes)]
+        kinds += [array(np.ravel(each)) for each in (rows.corners, rows.planes)]
+        self.shapes = kinds + [array(each, dtype=int) for each in (rows.starts, rows.loops)]
+        self.narrow = near_pairs.narrow(self.tables.sizes.pairs, self.near_count, T, routines)
 
     def _launch(self, kernel: Any, threads: int, inputs: list, outputs: list, block: int = 64) -> None:
         launches.launch(kernel, threads, [self.worlds, *inputs], outputs, device=self.device, block_dim=block)
 
-    def find_points(self) -> None:
-        """Find near pairs and their points, from ``poses``."""
+    def find_points(self, dt: float) -> None:
+        """Find near pairs and their points, from ``poses`` and ``velocities``."""
         a_world = near_pairs.LANES if self.device.is_cuda else 1
-        shapes = [self.poses, self.which, self.sides]
-        self._launch(self.broad, a_world * self.worlds, [*shapes, self.margin], [self.near], 128)
-        self._launch(self.narrow, self.near_count * self.worlds, [*shapes, self.near], [self.touches])
+        slack = self.margin + self.gravity * dt * dt
+        shapes = [self.poses, self.velocities, self.which, self.sides, slack, dt]
+        self._launch(self.broad, a_world * self.worlds, shapes, [self.near], 128)
+        threads = self.near_count * self.worlds
+        self._launch(self.narrow, threads, [*shapes, *self.shapes, self.near], [self.touches])
 
     def solve(
         self,
         q: wp.array,
         qd: wp.array,
         tau: wp.array | None,
-        targets: tuple[wp.array, wp.array | None],
+        targets: tuple[wp.array | None, wp.array | None],
         dt: float,
         passes: int = PASSES,
+        results: dict[str, wp.array] | None = None,
     ) -> None:
-        """Compute ``qd_out``, ``contact_f``, ``excess``, ``status`` from mass, bias, poses, and points."""
+        """Compute qd after the step and reports from mass, bias, surfaces, poses, and points.
+
+        ``results``: arrays in place of ``qd_out``, ``qdd``, ``contact_f`` and further attributes, by name.
+        """
         tau, (target_q, target_qd) = self.still if tau is None else tau, targets
-        system = [self.mass, self.bias, tau, q, qd, target_q, self.still if target_qd is None else target_qd]
-        system += [self.poses, self.near, self.touches, self.dof_values, self.pair_values, self.place]
-        out = [self.qd_out, self.contact_f, self.contact_gap, self.contact_slip, self.excess, self.status]
+        system = [self.mass, self.bias, tau, q, qd, self.neutral if target_q is None else target_q]
+        system += [self.still if target_qd is None else target_qd, self.poses, self.near, self.touches, self.surfaces]
+        system += [self.dof_values, self.pair_values, self.place]
+        names = "qd_out", "qdd", "contact_f", "contact_gap", "contact_slip", "excess", "status"
+        out = [(results or {}).get(name, getattr(self, name)) for name in names]
         a_world = self.lanes if self.device.is_cuda else 1
-        numbers = [dt, float(passes), self.half_gravity, self.margin]
+        numbers = [dt, float(passes), *self.tolerances]
         self._launch(self.solver, a_world * self.worlds, system + numbers, out, joint_space.BLOCK)
 
-    def find_system(self, q: wp.array, qd: wp.array) -> None:
-        """Compute mass, poses and bias of a state."""
-        launch = self.dyn._engine.launch
-        launch(MASS_MATRIX_PACKED, self.mass, q=q)
-        launch(BODY_POSES, self.poses, q=q)
-        launch(BIAS_FORCE, self.bias, q=q, qd=qd, body_f=self.lift)
+    def find_system(self, q: wp.array, qd: wp.array, dt: float, body_f: wp.array | None = None) -> None:
+        """Compute mass, poses, velocities, bias, surfaces, and what varies between worlds, of a state."""
+        engine, sizes = self.dyn._engine, self.tables.sizes
+        engine.launch(MASS_MATRIX_PACKED, self.mass, q=q)
+        engine.launch(BODY_STATES, self.poses, {"velocities_out": self.velocities}, q=q, qd=qd)
+        more = {joint_system.SURFACES: self.surfaces} if sizes.surfaces else {}
+        if self.names is not None:
+            more |= {joint_system.OF_DOFS: self.dof_values, joint_system.OF_PAIRS: self.pair_values}
+        options = dict(surfaces=bool(sizes.surfaces), pairs=tuple(self.tables.pairs), names=self.names)
+        engine.launch_routine(SYSTEM, self.bias, more, q=q, qd=qd, dt=dt, body_f=body_f, **options)
 
     def step(
         self,
         q: wp.array,
         qd: wp.array,
         tau: wp.array | None,
-        targets: tuple[wp.array, wp.array | None],
+        targets: tuple[wp.array | None, wp.array | None],
         dt: float,
         passes: int = PASSES,
         q_out: wp.array | None = None,
+        body_f: wp.array | None = None,
+        results: dict[str, wp.array] | None = None,
     ) -> wp.array:
-        """Return qd after the step; with ``q_out`` also q. ``targets``: q and qd of the drives, None is zero."""
-        self.find_system(q, qd)
-        self.find_points()
-        self.solve(q, qd, tau, targets, dt, passes)
+        """Return qd after the step; with ``q_out`` also q. ``targets``: q and qd of the drives, None is the neutral."""
+        self.find_system(q, qd, dt, body_f)
+        self.find_points(dt)
+        self.solve(q, qd, tau, targets, dt, passes, results)
+        after = (results or {}).get("qd_out", self.qd_out)
         if q_out is not None:
-            self.dyn._engine.launch_routine(INTEGRATE, q_out, q=q, qd=self.qd_out, dt=dt)
-        return self.qd_out
+            self.dyn._engine.launch_routine(INTEGRATE, q_out, q=q, qd=after, dt=dt)
+        return after
 
     def launch(
         self,
@@ -148,25 +259,41 @@ class JointSpaceStep:
         after: tuple[wp.array, wp.array],
         dt: float,
         passes: int,
-        further: dict[str, wp.array],
+        reports: dict[str, wp.array],
         tau: wp.array | None = None,
         target_q: wp.array | None = None,
         target_qd: wp.array | None = None,
-        **given: Any,
+        body_f: wp.array | None = None,
+        ctrl: wp.array | None = None,
     ) -> None:
-        """Launch the step of :meth:`Dynamics.step`; ``after``: arrays for q and qd, ``further``: others by name."""
-        for name, value in given.items():
-            if value is not None:
-                raise UnsupportedError("Dynamics.step", f"{name}= where bodies touch in joint space", "leave it out")
-        results = {"contact_f": self.contact_f, "contact_gap": self.contact_gap, "contact_slip": self.contact_slip,
-                   "contact_excess": self.excess, "status": self.status}  # fmt: skip
-        if lacks := [name for name in further if name not in results]:
-            raise UnsupportedError("Dynamics.step", f"{lacks[0]} where bodies touch in joint space", "leave it out")
-        aim = self.neutral if target_q is None else target_q
-        self.find_system(q, qd)
-        self.find_points()
-        self.solve(q, qd, tau, (aim, target_qd), dt, passes)
-        self.dyn._engine.launch_routine(INTEGRATE, after[0], q=q, qd=self.qd_out, dt=dt)
-        launches.copy(after[1], self.qd_out)
-        for name, array in further.items():
-            launches.copy(array, results[name])
+        """Launch the step of :meth:`Dynamics.step`; ``after``: arrays for q and qd, ``reports``: others by name."""
+        assert ctrl is None, "lacking() names actuators"
+        for name in (RESIDUAL, "contact_moment"):
+            if name in reports:
+                launches.fill(reports[name], 0)
+        renamed = {"contact_excess": "excess"}
+        results = {renamed.get(name, name): array for name, array in reports.items()} | {"qd_out": after[1]}
+        self.step(q, qd, tau, (target_q, target_qd), dt, passes, after[0], body_f, results)
+
+    @property
+    def fits(self) -> bool:
+        """Whether a world fits into the shared memory of a block."""
+        return not self.device.is_cuda or joint_space.world_bytes(self.tables.sizes, self.dyn.dtype) <= ROOM
+
+    def explain(self) -> str:
+        """Return in words how pairs are solved."""
+        threads = f", {self.lanes} threads a world" if self.device.is_cuda else ""
+        return (
+            f"pairs of bodies in joint space{threads}: {self.near_count} of {self.tables.sizes.pairs} pairs may be near"
+            f" each other in a world, and {self.slot_count} points of them have slots"
+        )
+
+
+def _pair_shape(shape: ConvexShape) -> PairShape:
+    """Return a shape of a pair as the narrow phase takes it."""
+    if shape.hull is not None:
+        return PairShape("hull", shape.hull.corners)
+    if shape.has_faces:
+        return PairShape("box", shape.size)
+    radius, half = max(shape.radius, TINY), float(shape.size[2])
+    return PairShape("capsule", (radius, half)) if half > 0.0 else PairShape("sphere", (radius,))

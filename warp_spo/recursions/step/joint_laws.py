@@ -274,6 +274,10 @@ class JointLaws:
         """Return the bound of the force that drive and actuators of a dof give together; None if there is none."""
         return self._most("joint_effort_limit", dof)
 
+    def velocity_limit(self, dof: int) -> Value | None:
+        """Return the bound of the rate of a dof; None if there is none."""
+        return self._most("joint_velocity_limit", dof)
+
     def is_weak(self, dof: int, most: float) -> bool:
         """Return whether a force of the size ``most`` obeys the effort limit of a dof in all worlds, for good."""
         name = "joint_effort_limit"
@@ -350,7 +354,7 @@ class JointLaws:
 
         A dof without inertia takes the resistance of the ``others`` instead.
         """
-        bound = self._most("joint_velocity_limit", dof)
+        bound = self.velocity_limit(dof)
         if bound is None or is_number(self.h, 0.0):
             return []
         qd, inertia = self.qd(dof), self.inertia(dof)

@@ -1,0 +1,113 @@
+"""What a solver of touching bodies in joint space reads of a state, beside the mass matrix and the bodies' poses.
+
+These are the bias force, the surfaces of the ground at the points that may touch it, and what the laws of joints, pairs
+and points have in a world, of values that are variable or differ between worlds. A surface's point moves along a
+parabola, as :mod:`.points` explains; the push and the depth of its law say so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from ...trace.emission import Store
+from ...trace.scalars import Value, is_constant, sqrt
+from ...trace.spatial import ZERO, Vector, dot, total
+from ..kinematics import zero
+from ..newton_euler import inverse_dynamics
+from ..step.actuation import build_joint_laws
+from ..step.joint_laws import JointLaws
+from .pairs import place_axes_of
+from .points import place_points, with_ancestors
+
+if TYPE_CHECKING:
+    from ..model.tracing import Trace
+
+SURFACES, OF_DOFS, OF_PAIRS = "surfaces", "dof_values", "pair_values"
+SURFACE = 11
+"""Entries of a surface: place, normal, depth; push and damping of its law; gap; 1 where the point comes out slowly."""
+AWAY = -1e3  # depth of a point that cannot move [m]
+LAWS = {
+    "stiffness": "joint_stiffness", "damping": "joint_damping", "ke": "joint_target_ke", "kd": "joint_target_kd",
+    "dry": "joint_friction", "lower": "joint_limit_lower", "upper": "joint_limit_upper",
+    "limit_ke": "joint_limit_ke", "limit_kd": "joint_limit_kd",
+}  # fmt: skip
+"""Values of a dof by their names in the kernel and in the scene."""
+OTHERS = (
+    "joint_effort_limit", "joint_velocity_limit", "joint_rest_q", "contact_stiffness", "contact_damping",
+    "contact_friction", "gravity",
+)  # fmt: skip
+"""Further values of the scene that laws read."""
+
+
+def joint_system(
+    trace: Trace, surfaces: bool, pairs: tuple[int, ...], names: tuple[tuple[str, ...], tuple[str, ...]] | None = None
+) -> list[Store]:
+    """out = bias force, with gravity compensation; SURFACES; OF_DOFS and OF_PAIRS, those that are no constants
+
+    ``surfaces``: whether points may touch the ground. ``names``: of the values of dofs, and of pairs; None: all are
+    constants. ``pairs``: the order of the scene's pairs, after which the surfaces follow.
+    """
+    trace.compensate_gravity()
+    laws = build_joint_laws(trace, trace.graph.input("dt", 0))
+    stores = list(inverse_dynamics(trace, qdd=zero, letter="f"))
+    numbers = _add_surfaces(trace, laws, stores) if surfaces else []
+    if names is not None:
+        first = len(trace.links.scene.contact_points)
+        rows = [*(first + pair for pair in pairs), *numbers]
+        stores += [*_dof_values(trace, laws, names[0]), *_pair_values(trace, laws, names[1], rows)]
+    return stores
+
+
+def _add_surfaces(trace: Trace, laws: JointLaws, stores: list[Store]) -> list[int]:
+    """Add the stores of the surfaces; return the number of the point of each."""
+    points = place_points(trace, laws, trace.vector("qd"), oriented=True)
+    links = [point.link for point in points]
+    place_axes_of(trace, links)
+    origins: dict[int | None, Vector] = {None: ZERO}
+    needed = with_ancestors(links)
+    for link in trace.active_links:
+        if id(link) in needed:
+            trace.label(link, "y")
+            own, over = trace.places[id(link)].pose.l, link.parent
+            origins[id(link)] = own if over is None else origins[id(over)] + trace.axes[id(over)] @ own
+    for at, point in enumerate(points):
+        trace.graph.step = f"contact {point.number}|y"
+        still = point.link is None
+        origin = ZERO if still else origins[id(point.link)]
+        place = [x + dot(axis, point.arm) for x, axis in zip(origin, point.axes, strict=True)]
+        normal = [dot(axis, point.normal) for axis in point.axes]
+        law: list[Value] = [AWAY, 0.0, 0.0] if still else [point.depth, point.push, point.d]
+        row = [*place, *normal, *law, point.gap, 0.0 if still else point.deep]
+        stores += [Store(SURFACES, (SURFACE * at + i,), value) for i, value in enumerate(row)]
+    return [point.number for point in points]
+
+
+def _dof_values(trace: Trace, laws: JointLaws, names: tuple[str, ...]) -> list[Store]:
+    found: list[Store] = []
+    for link in trace.active_links:
+        for i, dof in enumerate(link.dofs):
+            values: dict[str, Value | None] = {name: laws.value(source, dof) for name, source in LAWS.items()}
+            values["effort"], values["fastest"] = laws.effort_limit(dof), laws.velocity_limit(dof)
+            if link.hinge.quaternion is None:
+                values["rest"] = laws.value("joint_rest_q", link.coordinate + i)
+            found += _varying(OF_DOFS, len(names) * dof, names, values)
+    return found
+
+
+def _pair_values(trace: Trace, laws: JointLaws, names: tuple[str, ...], rows: list[int]) -> list[Store]:
+    found: list[Store] = []
+    for at, row in enumerate(rows):
+        values = {name: laws.value(f"contact_{name}", row) for name in ("stiffness", "damping", "friction")}
+        found += _varying(OF_PAIRS, len(names) * at, names, values)
+    half = {"gravity": 0.5 * sqrt(total(x * x for x in trace.links.gravity))}
+    return found + _varying(OF_PAIRS, len(names) * len(rows), ("gravity",), half)
+
+
+def _varying(array: str, first: int, names: Iterable[str], values: dict) -> list[Store]:
+    """Return the stores of those ``values`` that are no constants, in the order of ``names``."""
+    return [
+        Store(array, (first + i,), values[name])
+        for i, name in enumerate(names)
+        if values.get(name) is not None and not is_constant(values[name])
+    ]
