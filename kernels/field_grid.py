@@ -9,14 +9,26 @@ import math
 
 import warp as wp
 
+from . import hull_corners
 from .elementary import C_TYPE
 
 NAME = "grid_search"
 RULES = {
     "OUTWARD": 1e-3, "TIE": 1e-6, "DOWN": 0.5, "ACROSS": 0.17, "BESIDE": 0.35, "SLACK": 0.5, "PARALLEL": 1e-6,
     "FAR": 1e30, "APART": 0.94 * 0.94, "ABOVE": 0.5, "STANDS": 0.7, "PI": math.pi,
+    "LEAN": math.tan(hull_corners.LEAN), "NEARER": 1.0 - 1e-6,
 }  # fmt: skip
-KINDS = {"QUADRANTS": 4, "SIDE": 3, "RIM": 32, "POINT": 1, "LINE_Y": 2, "LINE_X": 3, "ROW": 9, "STEPS": 2}
+KINDS = {
+    "QUADRANTS": 4,
+    "SIDE": 3,
+    "RIM": 32,
+    "POINT": 1,
+    "LINE_Y": 2,
+    "LINE_X": 3,
+    "ROW": 9,
+    "STEPS": 2,
+    "CHOSEN": hull_corners.ROWS,
+}
 
 
 def definitions(code: str, T: type) -> list[str]:
@@ -442,19 +454,33 @@ struct grid_search
         }
     };
 
+    // The corners of a cell, which beyond an edge is level across it; ``last``: the numbers of the field's last cell.
+    static CUDA_CALLABLE inline void levelled(const REAL* cells, const int* each, const int* last, REAL* h)
+    {
+        int in[2];
+        for (int f = 0; f < 2; ++f) in[f] = each[f] > 0 ? (each[f] < last[f] ? each[f] : last[f]) : 0;
+        const REAL* at = cells + 4ll * (in[0] * (last[1] + 2) + in[1]);
+        for (int n = 0; n < 4; ++n) {
+            const int i = each[0] == in[0] ? n / 2 : each[0] > in[0];
+            const int j = each[1] == in[1] ? n % 2 : each[1] > in[1];
+            h[n] = at[2 * i + j];
+        }
+    }
+
     // Asked are the first height, the centre from there, the cell, points along x and y, how many cells to each side
     // are tried, and whether for a second one; found are the nearest cell, the second, and whether that is there.
     static CUDA_CALLABLE inline void sphere(const REAL* table, const REAL* asked, REAL* out)
     {
         const REAL *cells = table + 4ll * (int)asked[0], *size = asked + 4;
-        REAL at[2];
+        const int ring = (int)asked[8];
+        REAL at[2], corners[4];
         int middle[2], last[2];
         for (int f = 0; f < 2; ++f) {
             last[f] = (int)asked[6 + f] - 2;
-            at[f] = Foot::inside(asked[1 + f] * (1 / size[f]), asked[6 + f] - 1);
-            middle[f] = (int)(at[f] + (REAL)0.5);
+            const REAL x = asked[1 + f] * (1 / size[f]), most = asked[6 + f] - 1 + ring;
+            at[f] = x > -ring ? (x < most ? x : most) : -ring;
+            middle[f] = (int)(at[f] + ring + (REAL)0.5) - ring;
         }
-        const int ring = (int)asked[8];
         REAL first[3] = {0, 0, 0}, square = 0;
         out[2] = out[3] = 0;
         LOOP
@@ -463,28 +489,82 @@ struct grid_search
             int best[2] = {0, 0};
             LOOP
             for (int n = 0; n < 4 * ring * ring; ++n) {
-                int each[2] = {middle[0] - ring + n / (2 * ring), middle[1] - ring + n % (2 * ring)};
-                for (int f = 0; f < 2; ++f) each[f] = each[f] > 0 ? (each[f] < last[f] ? each[f] : last[f]) : 0;
-                const REAL* corners = cells + 4ll * (each[0] * (last[1] + 2) + each[1]);
+                const int each[2] = {middle[0] - ring + n / (2 * ring), middle[1] - ring + n % (2 * ring)};
+                levelled(cells, each, last, corners);
                 const Foot foot(
                     corners, size, (at[0] - each[0]) * size[0], (at[1] - each[1]) * size[1], asked[3], STEPS);
                 if (round) {
                     const REAL turned = foot.away[0] * first[0] + foot.away[1] * first[1] + foot.away[2] * first[2];
                     if (!foot.outside || !(turned < 0 || turned * turned < APART * foot.square * square)) continue;
                 }
-                if (foot.square < least) least = foot.square, best[0] = each[0], best[1] = each[1];
+                if (foot.square < NEARER * least) least = foot.square, best[0] = each[0], best[1] = each[1];
             }
             out[2 * round] = best[0], out[2 * round + 1] = best[1];
             if (round) {
                 if (!(least < FAR)) out[4] = 0;
                 continue;
             }
-            const REAL* corners = cells + 4ll * (best[0] * (last[1] + 2) + best[1]);
+            levelled(cells, best, last, corners);
             const Foot foot(
                 corners, size, (at[0] - best[0]) * size[0], (at[1] - best[1]) * size[1], asked[3], STEPS + 1);
             for (int x = 0; x < 3; ++x) first[x] = foot.away[x];
             square = foot.square, out[4] = foot.outside;
         }
+    }
+
+    // The hull's own ``count`` numbers are its corners; place and presence of those that touch, see hull_corners.
+    static CUDA_CALLABLE inline void corners(
+        const REAL* table, const REAL* asked, const REAL* of, int count, REAL* out)
+    {
+        const Field field(table, asked);
+        REAL reach[CHOSEN], lean[CHOSEN][2];
+        int best[CHOSEN];
+        for (int row = 0; row < CHOSEN; ++row) {
+            on::sincos(2 * PI / (CHOSEN - 1) * row, lean[row][1], lean[row][0]);
+            for (int f = 0; f < 2; ++f) lean[row][f] *= row ? LEAN : 0;
+            best[row] = 0, reach[row] = -FAR;
+        }
+        LOOP
+        for (int i = 0; i < count / 3; ++i) {
+            REAL w[3];
+            for (int x = 0; x < 3; ++x) {
+                w[x] = 0;
+                for (int k = 0; k < 3; ++k) w[x] += of[3 * i + k] * field.axes[3 * k + x];
+            }
+            const REAL ground = floor(field, field.centre[0] + w[0], field.centre[1] + w[1]);
+            const REAL depth = ground - (field.centre[2] + w[2]);
+            for (int row = 0; row < CHOSEN; ++row) {
+                const REAL far = depth + (lean[row][0] * w[0] + lean[row][1] * w[1]);
+                if (far > reach[row] + TIE) best[row] = i, reach[row] = far;
+            }
+        }
+        for (int row = 0; row < CHOSEN; ++row) {
+            for (int c = 0; c < 3; ++c) out[4 * row + c] = of[3 * best[row] + c];
+            out[4 * row + 3] = 1;
+            for (int before = 0; before < row; ++before)
+                if (best[before] == best[row]) out[4 * row + 3] = 0;
+        }
+    }
+
+    // The height of the field at a place, also beyond its edges; where its cell is steep that of the lowest corner.
+    static CUDA_CALLABLE inline REAL floor(const Field& field, REAL x, REAL y)
+    {
+        const REAL place[2] = {x / field.cell[0], y / field.cell[1]};
+        REAL part[2], h[4];
+        int each[2], last[2];
+        for (int f = 0; f < 2; ++f) {
+            part[f] = field.limited(place[f], f), last[f] = field.count[f] - 2;
+            each[f] = (int)part[f] < last[f] ? (int)part[f] : last[f];
+            part[f] -= each[f];
+            if (place[f] < 0) each[f] = -1;
+            if (place[f] > field.count[f] - 1) each[f] = last[f] + 1;
+        }
+        levelled(field.cells, each, last, h);
+        const REAL slope_x = (h[2] + h[3] - h[0] - h[1]) / (2 * field.cell[0]);
+        const REAL slope_y = (h[1] + h[3] - h[0] - h[2]) / (2 * field.cell[1]);
+        if (slope_x * slope_x + slope_y * slope_y > 1) return least(least(h[0], h[1]), least(h[2], h[3]));
+        const REAL low = h[0] + part[1] * (h[1] - h[0]), high = h[2] + part[1] * (h[3] - h[2]);
+        return low + part[0] * (high - low);
     }
 
     // The height of the field at a place.

@@ -66,7 +66,7 @@ def play(arguments: list[str] | None = None) -> int:
 
     learning = load_learning(parser)
     from .env import datasets, evaluation, export, recording, robots, settings
-    from .env.task_files import build, short_name
+    from .env.task_files import build, robot_file, short_name
     from .viewing import films
 
     own = short_name(options.task)
@@ -78,7 +78,7 @@ def play(arguments: list[str] | None = None) -> int:
         given = checked(options, chosen)
         _, tree = settings.gather(options.checkpoint.parent, own, options.settings, options.changes)
         of_learner, of_task = settings.split(tree)
-        learner = settings.changed(chosen.LEARNER, of_learner, "learner")
+        learner = settings.apply(chosen.LEARNER, of_learner, "learner")
         env = build(chosen, worlds, learning.pick_device(options.device), options.seed, of_task | given)
         wanted = env.command.shape[1] if env.has_commands else 0
         if options.command is not None and len(options.command) != wanted:
@@ -118,7 +118,8 @@ def play(arguments: list[str] | None = None) -> int:
     suffix = f".{options.film or 'gif'}"
     if getattr(chosen, "ROBOT", None) not in robots.NAMES or not hasattr(chosen, "CAMERA"):
         camera = getattr(chosen, "CAMERA", None)
-        for file in recording.play(env, policy, name, options.seconds, options.command, camera, suffix):
+        drawn = robot_file(chosen)
+        for file in recording.play(env, policy, name, options.seconds, options.command, camera, suffix, drawn):
             print(file)
         return 0
     recorded = recording.record(env, policy, options.seconds, options.command)

@@ -21,7 +21,7 @@ from pathlib import Path
 def main(arguments: list[str] | None = None) -> int:
     """List all tasks, or write a file to start from."""
     from .command_line import Parser
-    from .env.task_files import registered, start_file
+    from .env.task_files import find_registered, start_file
     from .env.tasks import TASKS
 
     parser = Parser(
@@ -42,7 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"{options.new}: train it with python -m warp_spo.train {options.new}")
         return 0
     modules = {name: f"warp_spo.env.tasks.{file}" for name, file in TASKS.items()}
-    modules |= {name: each.module for name, each in registered().items()}
+    modules |= {name: each.module for name, each in find_registered().items()}
     width = max(map(len, modules))
     for name, module in modules.items():
         print(f"{name:{width}}  {first_line(module)}")

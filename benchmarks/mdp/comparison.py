@@ -17,6 +17,7 @@ from .rules import Rules
 from .tasks import TASKS
 
 REWARD, OBSERVED = 1e-6, 1e-5  # largest errors of a reward, and of an observation
+LARGE = 10.0  # above it an observation's error is 1e-6 of its size: eight roundings of float32, as of rates of 25 rad/s
 SUMS = 1e-5  # of a reward's sum over an episode, over its size or 1
 LOUDEST = 3.0  # deviation of the actions of the last world; the first one's are zero
 RESETS, CHOSEN = 47, 0.1  # steps from one reset of random worlds to the next, and the share of worlds
@@ -51,7 +52,8 @@ class Comparison:
         self.faults: dict[str, list[Any]] = {}
         self.counts = dict.fromkeys(("ends", "time-outs", "first observations", "resets", "pushes"), 0)
         self.noise: dict[str, list[np.ndarray]] = {}
-        self.length, self.late = np.zeros(worlds), 0.0
+        self.late = 0.0
+        self.length, self.taken = np.zeros((2, worlds))
         self.action, self.before = np.zeros((2, worlds, env.num_actions))
         self.sums: dict[str, np.ndarray] = {}
         self._watch()
@@ -100,7 +102,7 @@ class Comparison:
         return {name: None if x is None else x.double().numpy() for name, x in own.items()}
 
     def _state(self, seen: dict[str, Any], time: np.ndarray, fresh: np.ndarray) -> State:
-        return State(time=time, action=self.action, last_action=self.before, fresh=fresh,
+        return State(time=time, taken=self.taken.copy(), action=self.action, last_action=self.before, fresh=fresh,
                      com=self.rules.com(), bias=self.rules.bias(), **seen)  # fmt: skip
 
     def _step(self, actions: torch.Tensor) -> None:
@@ -108,6 +110,7 @@ class Comparison:
         spoilt = ~torch.isfinite(actions).all(dim=1).numpy()
         self.before, self.action = self.action, np.where(spoilt[:, None], 0.0, actions.double().numpy())
         observed, reward, done, extras = env.step(actions)
+        self.taken += 1.0
         s = self._state(self.seen, (self.length + 1.0) * dt, np.zeros(env.num_envs, bool))
         if s.gap is not None and self.robot.field is None and env._steps % GAPS == 0:
             self.late = max(self.late, float(np.abs(s.gap - self.robot.gaps(s.q)).max()))
@@ -138,7 +141,8 @@ class Comparison:
         """Let worlds start anew; compare what all observe. ``judged``: the state before; None: in a reset."""
         env = self.env
         self.task.start(new)
-        self.length[new], self.action[new], self.before[new] = 0.0, 0.0, 0.0
+        for each in (self.length, self.taken, self.action, self.before):
+            each[new] = 0.0
         for each in self.sums.values():
             each[new] = 0.0
         seen = self._read(env._report) if judged is None else {
@@ -170,7 +174,7 @@ class Comparison:
                 if noise > 0.0:
                     self.noise.setdefault(f"{group}, {name}", []).append((off / noise).ravel())
                     off = np.sign(off) * np.maximum(np.abs(off) - noise, 0.0)
-                self._near(what, off, 0.0, OBSERVED)
+                self._near(what, off / np.maximum(1.0, np.abs(numbers[worlds]) / LARGE), 0.0, OBSERVED)
             if at != given.shape[1]:
                 self._fault(f"{group}: size", f"{given.shape[1]} numbers, not {at}")
 

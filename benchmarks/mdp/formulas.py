@@ -24,15 +24,16 @@ class State:
     """Arguments of the formulas of terms, [world, ...], float64.
 
     Attributes:
-        q, qd: coordinates and velocities. time: since the start of the episode [s]. action, last_action: of this step
-            and of the one before. command: or None. com: centre of mass of the base in its frame (3) [m]. bias: of
-            encoders [joint].
+        q, qd: coordinates and velocities. time: age of the episode, which starts of a training write [s]. taken: steps
+            since the world's last start. action, last_action: of this step and of the one before. command: or None.
+            com: centre of mass of the base in its frame (3) [m]. bias: of encoders [joint].
         force, gap, slip: of contact points, [point, 3] and [point], or None. fresh: whether the world has just started.
     """
 
     q: np.ndarray
     qd: np.ndarray
     time: np.ndarray
+    taken: np.ndarray
     action: np.ndarray
     last_action: np.ndarray
     command: Any

@@ -84,7 +84,7 @@ class Rules:
             row, column = self.tile[new].astype(int).T
             way = np.linalg.norm(judged.q[new, :2] - self.origins[row, column, :2], axis=1)
             up = way > 0.5 * TILE
-            asked = 0.5 * np.hypot(*judged.command[new, :2].T) * judged.time[new]
+            asked = 0.5 * np.hypot(*judged.command[new, :2].T) * judged.taken[new] * self.env.step_dt
             wanted = row + up - (~up & (way < asked))
             wanted = np.where(wanted < 0, 0, wanted)
             last = wanted >= len(self.origins)  # then it is drawn anew

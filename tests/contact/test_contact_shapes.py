@@ -52,7 +52,8 @@ def test_arguments_give_the_shape_again(kind):
     np.testing.assert_array_equal(again.positions, made.positions)
     assert again.radius == made.radius
     drawn, sizes, pose = made.shape.primitive(0.01)
-    assert len(sizes) == {"sphere": 1, "capsule": 2, "box": 3}[drawn] and min(sizes) > 0.0 and len(pose) == 7
+    count = {"sphere": 1, "capsule": 2, "cylinder": 2, "cone": 2, "box": 3, "ellipsoid": 3}[drawn]
+    assert len(sizes) == count and min(sizes) > 0.0 and len(pose) == 7
     try:
         samples = made.shape.convex("test").samples
     except spo.UnsupportedError:  # a shape for the ground alone

@@ -215,7 +215,7 @@ BUGS = {
     "dampers above ground": (law, "finish_point", "candidate * pushes", "pushes"),
     "last pass opens": (law, "finish_point", "closing * state.closed", "0.0"),
     "wrong lever": (dampers, "_mass", "r * weight", "r * (2.0 * weight)"),
-    "riser unseen": (ground, "surfaces", "_cell((x + moves[0] - ground.origin[0]) * rate_x, rows)[0]", "i"),
+    "riser unseen": (ground, "surfaces", "_cell(next_x, rows)[0]", "i"),
     "velocity terms of the path alone": (velocity_kicks, "_kick", "forces.__getitem__", "zero"),
     "rates of the last round": (velocity_kicks, "final_kick",
                                      "2.0 * (kick[dof] - previous_kick(dof))", "0.0"),

@@ -34,6 +34,11 @@ def case(name):
     if name in ("quadruped", "stairs"):
         scene = quadruped(ground=steps() if name == "stairs" else None)
         return scene, dict(zip(("q", "qd", "tau"), touching(scene, 3, WORLDS), strict=True))
+    if name in ("hulls", "hulls on stairs"):
+        scene = quadruped(ground=steps() if name == "hulls on stairs" else None)
+        barrel = np.array([[x, *y] for x in (-0.1, 0.1) for y in hexagon() * 0.08])
+        scene = scene.with_contacts([*scene.contacts, spo.Contact(0, hull=barrel)], scene.ground)
+        return scene, dict(zip(("q", "qd", "tau"), touching(scene, 3, WORLDS), strict=True))
     if name in ("crowded", "turning"):
         scene = mirrored() if name == "crowded" else with_turning(mirrored())
         return scene, dict(zip(("q", "qd", "tau"), touching(scene, 3, WORLDS), strict=True))
@@ -43,6 +48,12 @@ def case(name):
         return scene, states(scene, WORLDS) | {"ctrl": ctrl}
     scene = everywhere(furnished(zoo.random_tree(8, 1)), 1) if name == "tree" else everywhere(furnished(zoo.fork()), 0)
     return scene, states(scene, WORLDS)
+
+
+def hexagon():
+    """Corners [6, 2] of a hexagon about the origin."""
+    turn = np.pi / 3.0 * np.arange(6)
+    return np.stack([np.cos(turn), np.sin(turn)], axis=1)
 
 
 def mirrored():
@@ -100,6 +111,8 @@ def assert_alike(got, more, wanted):
         pytest.param("tree", True, marks=pytest.mark.slow),
         pytest.param("driven", True, marks=pytest.mark.slow),
         pytest.param("stairs", False, marks=pytest.mark.slow),
+        pytest.param("hulls", False, marks=pytest.mark.slow),
+        pytest.param("hulls on stairs", False, marks=pytest.mark.slow),
     ],
 )
 def test_warps_meet_at_barriers_alone(name, staged):

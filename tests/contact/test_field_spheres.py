@@ -8,7 +8,9 @@ from benchmarks.contact import shapes
 from support import contact_gradients
 from support.contact_cases import box
 from support.contact_steps import FIELDS, H, above, assert_is_dense
-from warp_spo.reference.field_spheres import nearest_points
+from warp_spo.reference import field_spheres
+from warp_spo.reference.contact import ContactStep
+from warp_spo.reference.field_spheres import find_cells, nearest_points
 
 
 @pytest.mark.parametrize("name", shapes.fields())
@@ -53,6 +55,24 @@ def test_gradients_are_differences(name):
         assert crossed <= 1 / 3, (argument, errors)  # one of three states is where the nearest cell changes
 
 
+def test_rounding_does_not_choose_the_cell(monkeypatch):
+    """On a ridge two cells share the nearest point: the one that is found stays for any rounding."""
+    heights = np.zeros((5, 5))
+    heights[2] = 0.02
+    heights[2, 2] = 0.05
+    moves = 1e-13 * np.random.default_rng(0).normal(size=(30, 3))
+
+    def counts():
+        """How many answers each place has; the first lie beside the ridge along y, the last beside those along x."""
+        places = ((0.208, 0.124, 0.06), (0.196, 0.222, 0.06), (0.254, 0.2015, 0.06), (0.145, 0.2016, 0.06))
+        size = np.array([0.1, 0.1])
+        return [len({tuple(find_cells(heights, place + move, size, 1, True)) for move in moves}) for place in places]
+
+    assert counts() == [1, 1, 1, 1]
+    monkeypatch.setattr(field_spheres, "NEARER", 1.0)
+    assert max(counts()) > 1
+
+
 def test_a_tilted_field_is_a_tilted_plane():
     slope = np.array([0.2, -0.1])
     x, y = np.arange(21) * 0.1 - 1.0, np.arange(31) * 0.1 - 1.5
@@ -73,3 +93,62 @@ def test_a_ball_in_a_groove_rests_on_both_sides():
     sink = 0.04 / np.cos(np.radians(40.0)) - states[-1, 2]
     assert abs(sink / (9.81 / (2e4 * np.cos(np.radians(40.0)) ** 2)) - 1.0) < 1e-2
     assert abs(states[-1, 0]) < 1e-4 and np.abs(states[-1, 7:]).max() < 1e-3
+
+
+OUTSIDE = {
+    "sphere": dict(sphere=((0, 0, 0), 0.05)),
+    "large sphere": dict(sphere=((0, 0, 0), 0.09)),
+    "cylinder": dict(cylinder=((0, -0.05, 0), (0, 0.05, 0), 0.05)),
+    "ellipsoid": dict(ellipsoid=(0.05, 0.05, 0.05)),
+    "box": dict(box=(0.05, 0.05, 0.05)),
+}
+
+
+@pytest.mark.parametrize("kind", OUTSIDE)
+def test_beyond_the_edge_a_field_is_level_across_it(kind):
+    """Of a slope of 20 degrees along x: no force along x beyond both ends, and the whole slope's beside it."""
+    slope, size = np.tan(np.radians(20.0)), 0.09 if kind == "large sphere" else 0.05
+    field = spo.HeightField(np.repeat(slope * (np.arange(21) - 10.0)[:, None] * 0.1, 21, 1), 0.1, (-1.0, -1.0))
+    scene = box().with_contacts([spo.Contact(0, **OUTSIDE[kind])], field)
+    places = np.array([[-3.0, 0.0], [3.0, 0.013], [-1.2, 0.0], [3.0, 5.0], [0.013, 2.0]])
+    q = np.array([[x, y, slope * np.clip(x, -1, 1) + size - 1e-3, 0, 0, 0, 1.0] for x, y in places])
+    q[4, 2] += size * (1.0 / np.cos(np.radians(20.0)) - 1.0) - 1e-3
+    a = {"q": q, "qd": np.zeros((5, 6))}
+    assert_is_dense(scene, a, 3)
+    for one in q:
+        points = ContactStep(scene, one, np.zeros(6), H).points
+        normals = points.n[points.depth > 0.0]
+        assert len(normals)
+        wanted = np.array([-slope if one[1] == 2.0 else 0.0, 0.0, 1.0])
+        np.testing.assert_allclose(normals, np.tile(wanted / np.linalg.norm(wanted), (len(normals), 1)), atol=1e-9)
+        if one[1] != 2.0:
+            assert abs(points.depth.max() - 1e-3) < 1e-9
+
+
+@pytest.mark.parametrize("radius", [0.05, 0.09])
+def test_a_sphere_before_the_edge_of_a_field_touches_its_slope(radius):
+    """The nearest point is on the slope inside: its depth is r - (z cos t - x sin t); in the kernel, too."""
+    slope, angle = np.tan(np.radians(20.0)), np.radians(20.0)
+    field = spo.HeightField(np.repeat(slope * np.arange(9)[:, None] * 0.1, 9, 1), 0.1, (0.0, -0.4))
+    scene = box().with_contacts([spo.Contact(0, sphere=((0, 0, 0), radius))], field)
+    x = np.array([-0.005, -0.35, 0.0])
+    q = np.array([[at, 0.013, radius - 2e-4, 0.0, 0.0, 0.0, 1.0] for at in x])
+    depths = [radius - ((radius - 2e-4) * np.cos(angle) - at * np.sin(angle)) for at in x]
+    depths[1] = 2e-4
+    found = [ContactStep(scene, one, np.zeros(6), H).points.depth.max() for one in q]
+    np.testing.assert_allclose(found[:2], depths[:2], atol=1e-9)
+    dyn = spo.Dynamics(scene, worlds=3, dtype="float64", device="cpu")
+    report = dyn.step_report("contact_gap", like=q)
+    dyn.step(q, np.zeros((3, 6)), dt=H, report=report)
+    np.testing.assert_allclose(-report.contact_gap[:, 0], found, atol=1e-12)
+
+
+def test_spheres_too_large_for_the_cells_are_a_warning(recwarn):
+    """Of 0.22 m on cells of 0.1 m, where the slope's nearest point is 1.5 cells aside; not on a gentle slope."""
+    x = np.arange(9)[:, None] * np.ones((1, 9)) * 0.1
+    contact = [spo.Contact(0, sphere=((0, 0, 0), 0.22))]
+    box().with_contacts(contact, spo.HeightField(0.5 * x, 0.1))
+    box().with_contacts([spo.Contact(0, sphere=((0, 0, 0), 0.2))], spo.HeightField(x, 0.1))
+    assert not recwarn
+    with pytest.warns(UserWarning, match=r"1 sphere\(s\) are larger than 0.211 m, .*contact 0 of body .*: 0.22 m"):
+        box().with_contacts(contact, spo.HeightField(x, 0.1))

@@ -95,8 +95,10 @@ def test_the_recursion_of_a_hull_is_the_dense_step(ground):
     assert_is_dense(scene, a, 3)
 
 
-def test_the_kernel_of_a_hull_is_the_dense_step():
-    scene = box().with_contacts([spo.Contact(0, hull=STONE, friction=0.4)], TILTED)
+@pytest.mark.parametrize("ground", ["plane", "stairs"])
+def test_the_kernel_of_a_hull_is_the_dense_step(ground):
+    ground = TILTED if ground == "plane" else FIELDS[ground]
+    scene = box().with_contacts([spo.Contact(0, hull=STONE, friction=0.4)], ground)
     a = {name: rows[:-1] for name, rows in above(scene, 5, 9).items()}
     dyn = spo.Dynamics(scene, worlds=8, dtype="float64", device="cpu")
     for q, qd, rates in zip(a["q"], a["qd"], dyn.step(a["q"], a["qd"], dt=H)[1], strict=True):
@@ -154,3 +156,28 @@ def test_a_wheel_rolls():
     """1 m/s stays 1 m/s for a second: the issue of points on a polygon, which made it stop."""
     states = shapes.rolled_wheel(5e-3)
     assert states[-1, 7] >= 0.999 and abs(states[-1, 0] - 1.0) < 2e-3 and np.abs(states[:, 8:10]).max() < 0.05
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_hull_of_many_corners_rests_on_a_sloping_cell(dtype):
+    """A prism of twelve corners that lies flat on slopes of 3 to 20 degrees sinks by m g cos t / (n k) at most."""
+    turns, angles = np.arange(6) * np.pi / 3.0, np.radians([3.0, 10.0, 20.0])
+    prism = np.array([(0.1 * np.cos(a), 0.1 * np.sin(a), z) for z in (-0.05, 0.05) for a in turns])
+    x = (np.arange(9) - 4.0) * 0.3
+    fields = spo.HeightField(np.stack([np.repeat((np.tan(t) * x)[:, None], 9, 1) for t in angles]), 0.3, (-1.2, -1.2))
+    scene = box().with_contacts([spo.Contact(0, hull=prism, friction=1.0)], fields)
+    scene = scene.with_values(ground_field=np.arange(3)[:, None])
+    q = np.zeros((3, 7))
+    for one, t in zip(q, angles, strict=True):
+        one[:3] = np.array([0.1, 0.13, 0.1 * np.tan(t)]) + 0.0501 * np.array([-np.sin(t), 0.0, np.cos(t)])
+        one[3:] = 0.0, -np.sin(0.5 * t), 0.0, np.cos(0.5 * t)
+    dyn = spo.Dynamics(scene, worlds=3, dtype=dtype, device="cpu")
+    qd = np.zeros((3, 6))
+    for _ in range(60):
+        q, qd = dyn.step(q, qd, dt=H)
+        for one, t in zip(q, angles, strict=True):
+            normal = np.array([-np.sin(t), 0.0, np.cos(t)])
+            places = pose_matrix(np.float64(one))[:3, :3] @ prism.T + np.float64(one[:3])[:, None]
+            assert (normal @ places).min() > -3e-4, t  # 0.1 mm at rest; it was 3.5 to 60 mm
+    for one, t, rate in zip(q, angles, qd, strict=True):
+        assert abs(2.0 * np.arcsin(-one[4]) - t) < 2e-3 and np.abs(rate).max() < 5e-3, (one, rate)

@@ -207,5 +207,5 @@ def test_weights_of_curricula_can_be_set_by_name():
     from warp_spo.env import settings
 
     held = (Curriculum(1.0, 2.0, ByStep(0, 8)), observations.command)
-    assert settings.changed(held, {"last": 5.0}, "rewards.x")[0].last == 5.0
-    assert settings.changed(held, 3, "rewards.x")[0] == 3.0
+    assert settings.apply(held, {"last": 5.0}, "rewards.x")[0].last == 5.0
+    assert settings.apply(held, 3, "rewards.x")[0] == 3.0

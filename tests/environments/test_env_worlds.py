@@ -264,6 +264,17 @@ def test_periods_are_whole_steps(dt, seconds):
     assert changed == [(steps * k, True, True, True) for k in range(1, count // steps + 1)]
 
 
+@pytest.mark.parametrize(("seconds", "dt", "steps"), [
+    (0.05, 0.02, 3), (0.29, 0.02, 15), (1.0, 0.02, 50), (0.3, 0.1, 3), (1.1, 0.1, 11), (0.001, 0.02, 1)
+])  # fmt: skip
+def test_an_episode_lasts_until_its_time_has_passed(seconds, dt, steps):
+    """The time-out is that of the first step whose end is at ``episode_length_s`` or later, and of no other."""
+    env = cart_env(1, dt=dt, decimation=1, terminations={}, episode_length_s=seconds)
+    assert env.max_episode_length == steps
+    outs = [bool(env.step(torch.zeros(1, 1))[3]["time_outs"][0]) for _ in range(steps)]
+    assert outs == [False] * (steps - 1) + [True]
+
+
 def test_waits_are_within_their_range_and_of_the_seed():
     """The first change of a value waits, too, and a reset with a seed repeats all of it."""
     env = cart_env(

@@ -151,7 +151,7 @@ def test_settings_reach_every_field_of_the_learner():
         held = getattr(learner, field.name)
         text = {bool: "false", int: "7", float: "0.5", tuple: "[32, 16]", str: "bfloat16"}[type(held)]
         own, _ = settings.split(settings.parse([f"learner.{field.name}={text}"]))
-        found = getattr(settings.changed(learner, own, "learner"), field.name)
+        found = getattr(settings.apply(learner, own, "learner"), field.name)
         assert type(found) is type(held) and found == READ.get(text, (32, 16))
 
 

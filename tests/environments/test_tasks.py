@@ -15,6 +15,7 @@ from warp_spo.env import evaluation, learning, observations, robots, training_lo
 from warp_spo.env.tasks import TASKS, go2_flat, go2_rough, task, velocity  # noqa: E402
 from warp_spo.viewing import Camera, Primitive, films  # noqa: E402
 from warp_spo.viewing.renderer import Renderer  # noqa: E402
+from warp_spo.viewing.surfaces import primitive_surface  # noqa: E402
 
 
 def roll(env, steps, seed=0):
@@ -215,6 +216,23 @@ def test_a_sphere_is_drawn_where_it_is():
     assert len(red) == pytest.approx(np.pi * radius**2, rel=0.03)
 
 
+@pytest.mark.parametrize(("kind", "size", "area"), [
+    ("cylinder", (0.3, 0.2), 2 * 0.3 * 2 * 0.2),
+    ("cone", (0.3, 0.2), 0.3 * 2 * 0.2),
+    ("ellipsoid", (0.3, 0.2, 0.1), np.pi * 0.3 * 0.1),
+])  # fmt: skip
+@pytest.mark.parametrize("triangles", [False, True])
+def test_a_round_shape_is_drawn_with_its_outline(kind, size, area, triangles):
+    """From far away a picture of its side has the area of its outline: contacts' shapes, and those of a file."""
+    camera = Camera(distance=20.0, azimuth=-0.5 * np.pi, elevation=0.0, width=240, height=160, view=0.05)
+    shape = Primitive(kind, -1, size, (0, 0, 1, 0, 0, 0, 1), (1.0, 0.0, 0.0))
+    renderer = Renderer([primitive_surface(shape) if triangles else shape], 0, None, camera)
+    picture = renderer.draw(np.zeros((0, 7)), np.array([0.0, 0.0, 1.0])).astype(int)
+    red = (picture[..., 0] > picture[..., 1] + 60).sum()
+    pixel = 2 * 20.0 * np.tan(0.025) / 160
+    assert red * pixel**2 == pytest.approx(area, rel=0.05)  # 20 edges about the axis, and whole pixels
+
+
 def test_the_ground_is_drawn_where_it_is():
     """The depth of the middle of a picture is the camera's distance, if it looks at a point of the ground."""
     ramp = spo.HeightField(0.3 * np.arange(5.0)[:, None] + 0.1 * np.arange(3.0), (0.5, 0.25), (-1.0, -0.2, 0.4))
@@ -301,6 +319,18 @@ def test_measures_of_a_known_course():
 
     found = evaluation.balance(env, policy)
     assert found["worlds"] == 4 and found["upright"] == 2 and found["least share"] == 0.0
+
+
+def test_a_new_start_is_no_place_that_was_reached():
+    """A world that ends early names another place as it starts anew; no command of its first episode changed before."""
+    env = envs.make("panda-reach", 2, "cpu")
+
+    def policy(observed):
+        env.qd[0] = 1e9 if int(env.episode_length_buf[0]) == 5 else 0.0  # beyond its bounds: the world ends
+        return torch.zeros(2, env.num_actions)
+
+    found = evaluation.reach(env, policy, "hand")
+    assert found["places"] == 3  # of the other world, whose episode has four
 
 
 @pytest.mark.slow

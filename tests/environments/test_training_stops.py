@@ -2,6 +2,7 @@
 
 import os
 import re
+import resource
 import shutil
 import signal
 import subprocess
@@ -23,6 +24,7 @@ from warp_spo.env import Env, actions, commands, events, robots, terminations, t
 from warp_spo.env.tasks import go2_flat, velocity  # noqa: E402
 
 LEARNER = learning.Learner(iterations=5, steps=4, hidden=(8,), epochs=2, batches=2)
+SOON = 5.0  # from the end of an iteration to the end of the training [s]
 CLOCKS = {"seconds", "collecting", "learning"}  # of a row, which two trainings do not share
 
 
@@ -110,11 +112,17 @@ def test_a_randomised_go2_with_a_curriculum_has_the_same_bits(tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_a_training_with_a_checkpoint(number, tmp_path, monkeypatch, capsys):
-    """After the iteration; the curve is drawn, and the last line is a command that goes on."""
-    interrupt(monkeypatch, 2, number)
+    """After the iteration; the curve is drawn, and the last line is a command that goes on.
+
+    From the signal on it takes ``SOON`` seconds of a core at most, of which a machine that does nothing else gives it
+    as many as pass.
+    """
+    came = []
+    meanwhile(monkeypatch, 2, lambda _: (came.append(time.process_time()), os.kill(os.getpid(), number)))
     given = ["cartpole", "--worlds", "4", "--device", "cpu", "--iterations", "9", "--out", str(tmp_path)]
     before = signal.getsignal(number)
     assert train.main(given) == 128 + number and signal.getsignal(number) is before
+    assert time.process_time() - came[0] < SOON
     assert torch.load(tmp_path / "last.pt", weights_only=True)["iter"] == 2
     assert {"model_2.pt", "curve.png"} <= {file.name for file in tmp_path.iterdir()}
     last = capsys.readouterr().out.splitlines()[-1]
@@ -339,15 +347,25 @@ def wait_for_line(process, words, seconds=120.0):
     raise AssertionError(f"no line with {words!r}")
 
 
+def seconds_of(process):
+    """Return the seconds that a process and its children have had of a core."""
+    found = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout.split()
+    stats = [Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split() for pid in (process.pid, *found)]
+    return sum(int(ticks) for stat in stats for ticks in stat[11:13]) / os.sysconf("SC_CLK_TCK")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_two_processes_end_by_a_signal(number, tmp_path):
-    """Both, with the signal's status, and none is left behind; one of the two is enough to stop by the clock."""
+    """Both, soon, with the signal's status, and none is left behind; one of the two is enough to stop by the clock."""
+    ended = sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
     process = command("--gpus", "2", "--iterations", "9999", "--out", str(tmp_path))
     wait_for_line(process, "iteration    0")
+    before = seconds_of(process)
     process.send_signal(number)
     out = process.communicate(timeout=60)[0]
     assert process.returncode == 128 + number, out
+    assert sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2]) - ended - before < 2 * SOON  # of both
     assert "go on: python -m warp_spo.train cartpole" in out.splitlines()[-1]
     assert len(torch.load(tmp_path / "last.pt", weights_only=True)["worlds"]) == 2
     again = command(

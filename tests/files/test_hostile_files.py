@@ -39,6 +39,11 @@ REFUSED = {
     "an infinite mass": robot(link("a"), link("b").replace('value="1"', 'value="inf"'), joint("a", "b")),
     "a long name of no link": robot(link("a"), joint("x" * 70_000, "a")),
     "a long word for a type": robot(link("a"), link("b"), joint("a", "b", "x" * 70_000)),
+    "a long size of a shape that gives a mass": robot(
+        link("a"),
+        f'<link name="b"><collision><geometry><sphere radius="{"x" * 70_000}"/></geometry></collision></link>',
+        joint("a", "b"),
+    ),
     "a torn file": robot(link("a"), link("b"), joint("a", "b"))[:-25],
     "no file at all": "\0\1\2\3" * 100,
 }  # fmt: skip

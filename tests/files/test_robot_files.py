@@ -1,5 +1,6 @@
 """Robot files (URDF, MJCF, USD): the scene of a file moves as Newton's import of it, or an error names the cause."""
 
+import re
 import sys
 
 import newton
@@ -9,6 +10,7 @@ import pytest
 from support.newton_models import FLOAT32, assert_kinematics_agree, finalize
 from warp_spo.errors import DirectedLoopError
 from warp_spo.newton import from_newton, load, shipped
+from warp_spo.newton.files.load import FORMATS
 
 BUILDERS = {".xml": "add_mjcf", ".urdf": "add_urdf"}
 
@@ -110,3 +112,67 @@ def test_files_that_are_not_robots(tmp_path):
             load(tmp_path / "robot.xml")
     with pytest.raises(ValueError, match="shipped: unknown robot 'hal'; expected one of humanoid"):
         shipped("hal")
+
+
+PATHS = {
+    "None": (None, TypeError, "path is None; expected the path of a robot file"),
+    "a number": (123, TypeError, "path is 123; expected the path"),
+    "bytes": (b"a.urdf", TypeError, "path is b'a.urdf'; expected the path"),
+    "a list": (["a.urdf"], TypeError, r"path is \['a.urdf'\]; expected the path"),
+    "nothing": ("", ValueError, "path is ''; expected the path of a robot file"),
+    "a text": ("<robot name='r'/>", ValueError, ".*is a robot description, not a path; write it into a file"),
+    "a folder": (
+        ".",
+        ValueError,
+        "'.' is a folder; expected the path of a robot file in it; it holds 'a.urdf', 'b.xml'$",
+    ),
+    "a folder of a robot's name": ("c.urdf", ValueError, "'c.urdf' is a folder; .*; it holds none$"),
+    "no suffix": ("robot", ValueError, "'robot' has no suffix; expected one of .urdf, .*; rename the file"),
+    "a long path": (
+        "x" * 5000 + ".xml",
+        FileNotFoundError,
+        r"no file 'x+\.\.\.x+.xml' .*; expected the path of an MJCF",
+    ),
+    "a home": ("~/no.usd", FileNotFoundError, r"no file '~/no.usd' .* ~ is not replaced: .*expanduser\(\)"),
+}
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_what_is_no_path_is_named_with_a_way_out(name, tmp_path, monkeypatch):
+    path, error, words = PATHS[name]
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "c.urdf").mkdir()
+    for file in ("a.urdf", "b.xml", "readme.txt"):
+        (tmp_path / file).touch()
+    with pytest.raises(error, match=f"^load: {words}") as caught:
+        load(path)
+    assert len(str(caught.value)) < 700
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_empty_files_and_texts_of_nothing(suffix, tmp_path):
+    """The error says which format the suffix promises, and names no source file of another library."""
+    file = tmp_path / f"robot{suffix}"
+    expected = {"urdf": "a URDF file, whose first element is <robot>", "mjcf": "an MJCF file, whose.* <mujoco>"}
+    for text, words in (("", "is empty"), ("hello", "is not XML|OpenUSD cannot open it")):
+        file.write_text(text)
+        with pytest.raises(ValueError, match=f"^load: '.*robot{suffix}'.*({words})") as caught:
+            load(file)
+        assert re.search(
+            f"expected {expected.get(FORMATS[suffix], 'a USD file')}.*; correct the file$", str(caught.value)
+        )
+        assert "pxr" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"floating": "yes"}, "load: floating is 'yes'; expected None, True or False"),
+        ({"repair": "no"}, "load: repair is 'no'; expected True or False"),
+        ({"contacts": False}, "load: .*cartpole.urdf': contacts is False; expected True, .*; None, for no contacts"),
+        ({"contacts": True, "ground": 3}, "load: .*cartpole.urdf': .*ground is of type int; expected spo.Plane"),
+    ],
+)
+def test_arguments_of_another_type(options, words):
+    with pytest.raises(TypeError, match=f"^{words}"):
+        load(shipped("cartpole"), **options)

@@ -148,9 +148,9 @@ def _worst(substep, status, word):
 
 
 def _searched(shape, cells, asked, worlds):
-    """Return the numbers that a search of a field's grid finds, each [world]."""
+    """Numbers that a search finds, each [world]: in a field's grid, or of the corners of a hull without ``cells``."""
     numbers = np.stack([x + 0.0 * worlds for x in asked], axis=-1)
-    return list(evaluation._search(shape, np.ravel(cells), numbers).T)
+    return list(evaluation._search(shape, None if cells is None else np.ravel(cells), numbers).T)
 
 
 FUNCTIONS = {
@@ -175,6 +175,8 @@ FORMS = [
     (r"^(?:static )?const (?:float|double) (\w+_(?:asked|of))\[\d+\] = \{(.*)\};$", r"\1 = [\2]"),
     (r"^(?:float|double) (\w+_row)\[(\d+)\];$", r"\1 = [0.0 * worlds] * \2"),
     (r"^grid_search::(\w+)\((\w+)\.data, (\w+), (\w+)\);$", r"\4 = searched('\1', \2, \3, worlds)"),
+    (r"^grid_search::(\w+)\((\w+)\.data, (\w+), (\w+), \d+, (\w+)\);$", r"\5 = searched('\1', \2, \3 + \4, worlds)"),
+    (r"^hull_corners::(\w+)\((\w+), (\w+), \d+, (\w+)\);$", r"\4 = searched('\1', None, \2 + \3, worlds)"),
     (r"^const int (now) = (.*);$", r"\1 = \2"),
     (r"^const \w+\* (\w+) = table\.data \+ (.*);$", r"\1 = \2"),
     (

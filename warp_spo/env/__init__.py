@@ -101,7 +101,8 @@ def skrl(env: Env, observations: str | None = None, states: str | None = None) -
     Args:
         env: the environment.
         observations: the group that the policy sees; None: the first.
-        states: the group that the critic sees; None: the second, if there is one.
+        states: the group that the critic sees; None: the second, if there is one and ``observations`` is None, too;
+            otherwise the critic gets no states of its own.
     """
     from .interfaces import make_skrl
 

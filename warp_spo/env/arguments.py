@@ -11,6 +11,7 @@ from ..errors import UnsupportedError, is_bool, shown
 from ..scene.scene import Scene
 from .bounds import Bounds
 from .compile.guard import BEYOND, NOT_FINITE
+from .compile.memory_layout import count_steps
 from .curricula import ends_of
 from .observations import Observation, TorchTerm
 from .validation import check_function, check_mapping, check_number, check_whole
@@ -19,7 +20,7 @@ INTEGERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
 RESULTS = ("reward", "done", "time_out")
 
 
-def checked_terms(
+def check_terms(
     observations: Any, rewards: Any, terminations: Any, metrics: Any, events: Any
 ) -> tuple[dict[str, list[Observation]], dict[str, tuple[Any, Any]], dict[str, Any], dict[str, Any]]:
     """Return observations, rewards, terminations and metrics by name; ValueError and TypeError as :class:`Env` says."""
@@ -53,7 +54,7 @@ def checked_terms(
     return groups, rewards, terminations, metrics
 
 
-def checked_scene(scene: Any) -> Scene:
+def check_scene(scene: Any) -> Scene:
     """Return a scene; TypeError for anything else, UnsupportedError for one with closed loops or couplings."""
     if not isinstance(scene, Scene):
         raise TypeError(f"Env: scene is {type(scene).__name__}; expected spo.Scene")
@@ -66,16 +67,16 @@ def checked_scene(scene: Any) -> Scene:
     return scene
 
 
-def checked_times(dt: Any, decimation: Any, episode_length_s: Any) -> tuple[float, int, int]:
+def check_times(dt: Any, decimation: Any, episode_length_s: Any) -> tuple[float, int, int]:
     """Return the length of a step of the dynamics [s], their number in a step, and the steps of an episode."""
     steps = check_whole("Env", "decimation", decimation, 1)
     for name, value in (("dt", dt), ("episode_length_s", episode_length_s)):
         if check_number("Env", name, value) <= 0.0:
             raise ValueError(f"Env: {name} is {value!r} s; expected more than zero")
-    return float(dt), steps, max(1, round(episode_length_s / (float(dt) * steps)))
+    return float(dt), steps, count_steps(episode_length_s, float(dt) * steps)
 
 
-def checked_default(scene: Scene, default_q: Any) -> np.ndarray:
+def check_default(scene: Scene, default_q: Any) -> np.ndarray:
     """Return the coordinates that episodes start from [coordinate]; the scene's neutral ones for None."""
     default = np.asarray(scene.neutral_q if default_q is None else default_q, dtype=np.float64)
     if default.shape != (scene.coord_count,):
@@ -85,28 +86,28 @@ def checked_default(scene: Scene, default_q: Any) -> np.ndarray:
     return default
 
 
-def checked_passes(scene: Scene, passes: Any) -> int | None:
+def check_passes(scene: Scene, passes: Any) -> int | None:
     """Return the passes of a step, None as given; ValueError for no whole number, or for a scene without contacts."""
     if passes is not None and not scene.contacts:
         raise ValueError(f"Env: passes is {passes!r}, and the scene has no contacts; expected None")
     return None if passes is None else check_whole("Env", "passes", passes, 1)
 
 
-def checked_bool(name: str, value: Any) -> bool:
+def check_bool(name: str, value: Any) -> bool:
     """Return True or False; ValueError for anything else."""
     if not is_bool(value):
         raise ValueError(f"Env: {name} is {value!r}; expected True or False")
     return bool(value)
 
 
-def checked_bounds(bounds: Any) -> Bounds:
+def check_bounds(bounds: Any) -> Bounds:
     """Return bounds, those of defaults for None; TypeError for anything else."""
     if not isinstance(bounds, Bounds | None):
         raise TypeError(f"Env: bounds is {bounds!r}; expected warp_spo.env.Bounds, or None")
     return bounds or Bounds()
 
 
-def checked_parts(actions: Any) -> list[Any]:
+def check_parts(actions: Any) -> list[Any]:
     """Return one of ``warp_spo.env.actions``, or several, as a list; TypeError for anything else."""
     parts = list(actions) if isinstance(actions, list | tuple) else [actions]
     for part in parts:
@@ -117,14 +118,14 @@ def checked_parts(actions: Any) -> list[Any]:
     return parts
 
 
-def checked_commands(commands: Any) -> Any:
+def check_commands(commands: Any) -> Any:
     """Return None, or one of ``warp_spo.env.commands``; TypeError for anything else."""
     if commands is not None and not all(hasattr(commands, name) for name in ("draw", "update", "size", "seconds")):
         raise TypeError(f"Env: commands is {commands!r}; expected None, or one of warp_spo.env.commands")
     return commands
 
 
-def checked_actions(call: str, actions: Any, worlds: int, labels: list[str]) -> torch.Tensor:
+def check_actions(call: str, actions: Any, worlds: int, labels: list[str]) -> torch.Tensor:
     """Return actions [world, action] as a tensor; TypeError or ValueError if they are none, or require grad."""
     try:
         tensor = torch.as_tensor(actions)
@@ -144,7 +145,7 @@ def checked_actions(call: str, actions: Any, worlds: int, labels: list[str]) -> 
     return tensor
 
 
-def checked_mask(call: str, mask: Any, worlds: int, device: torch.device) -> torch.Tensor:
+def check_mask(call: str, mask: Any, worlds: int, device: torch.device) -> torch.Tensor:
     """Return a mask of worlds as a bool tensor [world] on the device.
 
     Raises:
@@ -160,7 +161,7 @@ def checked_mask(call: str, mask: Any, worlds: int, device: torch.device) -> tor
     return found
 
 
-def checked_lengths(call: str, value: Any, worlds: int) -> torch.Tensor:
+def check_lengths(call: str, value: Any, worlds: int) -> torch.Tensor:
     """Return steps since the starts of episodes, one for all worlds or one each; ValueError for what is none."""
     try:
         found = torch.as_tensor(value)

@@ -48,10 +48,10 @@ class Bounds:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            given, own = getattr(self, field.name), field.name in ("coordinate", "action")
-            numbers = [*given.values()] if isinstance(given, Mapping) and not own else [given]
+            given, is_single = getattr(self, field.name), field.name in ("coordinate", "action")
+            numbers = [*given.values()] if isinstance(given, Mapping) and not is_single else [given]
             if given is not None and not all(map(_is_bound, numbers)):
-                more = "" if own else ", or such numbers by regular expression"
+                more = "" if is_single else ", or such numbers by regular expression"
                 raise ValueError(
                     f"Bounds: {field.name} is {given!r}; expected None, or a number above zero (math.inf: none){more}"
                 )

@@ -376,11 +376,11 @@ class CapturedPPO(PPO):
         return found
 
     # -- numbers that are not finite -------------------------------------------------------------------------------
-    def _learned(self) -> list[torch.Tensor]:
+    def _learned_tensors(self) -> list[torch.Tensor]:
         """Return the tensors that learning changes: networks, normalisers, the optimizer's state."""
         if self._fused is not None:
             models = (self._raw_actor, self._raw_critic)
-            return [*self._fused.learned(), *(x for model in models for x in model.obs_normalizer.buffers())]
+            return [*self._fused.learned_tensors(), *(x for model in models for x in model.obs_normalizer.buffers())]
         networks = [*self._raw_actor.state_dict().values(), *self._raw_critic.state_dict().values()]
         state = [value for each in self.optimizer.state.values() for value in each.values()]
         return networks + [value for value in state if isinstance(value, torch.Tensor)]
@@ -388,15 +388,15 @@ class CapturedPPO(PPO):
     @torch.no_grad()
     def _keep(self) -> None:
         """Copy what learning changes."""
-        tensors = self._learned()
+        tensors = self._learned_tensors()
         if [x.shape for x in self._kept] != [x.shape for x in tensors]:
             self._kept = tuple(torch.empty_like(x) for x in tensors)
         torch._foreach_copy_(self._kept, tensors)
 
     @torch.no_grad()
     def _restore(self) -> None:
-        """Make of networks, normalisers, optimizer and learning rate what they were before the update."""
-        tensors = self._learned()
+        """Undo an update: copy back networks, normalisers and optimizer from :meth:`_keep`, and the learning rate."""
+        tensors = self._learned_tensors()
         torch._foreach_copy_(tensors[: len(self._kept)], self._kept)
         self.learning_rate = self._kept_rate
         self._rate.fill_(self.learning_rate)

@@ -28,7 +28,7 @@ def write_lengths(self: Env, value: torch.Tensor) -> None:
     """Set steps since the starts of episodes; where they change, the log leaves the length of the episode out."""
     lengths = self._tensors["episode_length"]
     before = lengths.clone()
-    lengths.copy_(arguments.checked_lengths("Env.episode_length_buf", value, self.num_envs))
+    lengths.copy_(arguments.check_lengths("Env.episode_length_buf", value, self.num_envs))
     self._log.write_ages(self._tensors["memory"], lengths != before)
 
 
@@ -109,7 +109,10 @@ def copy_worlds(env: Env, worlds: torch.Tensor) -> dict[str, torch.Tensor]:
 
 
 def restore_worlds(env: Env, worlds: torch.Tensor, copies: Mapping[str, torch.Tensor]) -> None:
-    """Make worlds what they were when :func:`copy_worlds` copied them; a :class:`TorchTerm` has to remember itself."""
+    """Copy back into ``worlds``, indices, what :func:`copy_worlds` returned.
+
+    What the function of a :class:`TorchTerm` keeps by itself is not among it.
+    """
     for name, (tensor, axis) in _by_world(env).items():
         tensor.index_copy_(axis, worlds, copies[name])
     if env._values_later:

@@ -90,7 +90,7 @@ def record(env: Env, policy: Policy, dataset_id: str, episodes: int, command: An
                     found[world].append(rows)
                     open_ones[world] = _begin(seen, world)
     chosen = [found[world][number] for number in range(quota) for world in range(env.num_envs)][:episodes]
-    buffers = [EpisodeBuffer(id=i, **{name: _stacked(rows[name]) for name in ROWS}) for i, rows in enumerate(chosen)]
+    buffers = [EpisodeBuffer(id=i, **{name: _stack(rows[name]) for name in ROWS}) for i, rows in enumerate(chosen)]
     observation_space, _ = spaces_of(env)
     return minari.create_dataset_from_buffers(
         dataset_id, buffers, observation_space=observation_space, action_space=_action_space(env), **about
@@ -110,7 +110,7 @@ def _begin(seen: dict[str, np.ndarray], world: int) -> dict[str, Any]:
     return rows
 
 
-def _stacked(rows: Any) -> Any:
+def _stack(rows: Any) -> Any:
     """Return rows as an array; those of several groups as a dictionary of them, of one group as that."""
     if isinstance(rows, dict):
         groups = {name: np.array(values, dtype=np.float32) for name, values in rows.items()}

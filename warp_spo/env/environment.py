@@ -68,7 +68,7 @@ class Env(VecEnv):
         metrics: terms by name whose means over episodes are logged; nothing else depends on them.
         commands: None, or one of :mod:`warp_spo.env.commands`.
         events: of :mod:`warp_spo.env.events`.
-        episode_length_s: after this time an episode ends with a time-out [s].
+        episode_length_s: after this time, rounded up to whole steps, an episode ends with a time-out [s].
         default_q: coordinates [coordinate] of starts, to which joints and actions are relative; None: the scene's.
         seed: of all random numbers, 64 bits.
         first_world: number of world 0 in a run on several devices; a world's numbers depend on its own number alone.
@@ -128,24 +128,24 @@ class Env(VecEnv):
     ):
         self._given = {name: value for name, value in locals().items() if name != "self"}
         self._alone: dict[tuple[int, ...], Env] = {}  # of one world, for replays of failures
-        self.scene, self.num_envs = arguments.checked_scene(scene), worlds
+        self.scene, self.num_envs = arguments.check_scene(scene), worlds
         self.warp_device = parse_device(str(device) if device is not None else None, "Env")
         self.device = torch.device(wp.device_to_torch(self.warp_device))
-        self.dt, self.decimation, self.max_episode_length = arguments.checked_times(dt, decimation, episode_length_s)
+        self.dt, self.decimation, self.max_episode_length = arguments.check_times(dt, decimation, episode_length_s)
         self.step_dt = self.dt * self.decimation
         self.first_world = check_whole("Env", "first_world", first_world, 0, 2**32 - 1)
         self.seed, self.cfg = check_whole("Env", "seed", seed, 0, 2**64 - 1), {} if cfg is None else cfg
         self.options: dict[str, Any] = {}
         self.log_interval = check_whole("Env", "log_interval", log_interval, 1)
-        self._passes, self.has_commands = arguments.checked_passes(scene, passes), commands is not None
-        self.final = arguments.checked_bool("final_observations", final_observations)
-        default, commands = arguments.checked_default(scene, default_q), arguments.checked_commands(commands)
-        terms = arguments.checked_terms(observations, rewards, terminations or {}, metrics or {}, events)
-        self.bounds = arguments.checked_bounds(bounds)
+        self._passes, self.has_commands = arguments.check_passes(scene, passes), commands is not None
+        self.final = arguments.check_bool("final_observations", final_observations)
+        default, commands = arguments.check_default(scene, default_q), arguments.check_commands(commands)
+        terms = arguments.check_terms(observations, rewards, terminations or {}, metrics or {}, events)
+        self.bounds = arguments.check_bounds(bounds)
         guard = Guard(self.bounds.limits(scene, self.dt, episode_length_s, list(terms[1]), terms[0]))
         self._layout = MemoryLayout(scene, default, self.step_dt, commands, changed_values(scene, events), guard)
         self._layout.keeps_failures = keep_failures is not None
-        tracing = self._trace(arguments.checked_parts(actions), *terms, commands, events)
+        tracing = self._trace(arguments.check_parts(actions), *terms, commands, events)
         variable = self._layout.values
         self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=variable, granularity=granularity)
         store = self._store = self._allocate(tracing)
@@ -167,7 +167,7 @@ class Env(VecEnv):
         self._read_first, self._steps = tracing.stages["act"].read_arrays(), 0
         self._failures = None if keep_failures is None else FailureRing(self, keep_failures)
         self._status = None if self._failures is None else self._failures.status
-        wanted = graph is None or arguments.checked_bool("graph", graph)
+        wanted = graph is None or arguments.check_bool("graph", graph)
         self.replay = Replay(self._parts(), wanted and self.warp_device.is_cuda)
         if self.warp_device.is_cuda:
             self._compile()
@@ -294,7 +294,7 @@ class Env(VecEnv):
         if mask is None:
             self.chosen.fill_(True)
         else:
-            mask = arguments.checked_mask("Env.reset", mask, self.num_envs, self.device)
+            mask = arguments.check_mask("Env.reset", mask, self.num_envs, self.device)
             self.chosen.copy_(mask)
         before = self._store.out.clone()
         self._launch("reset")
@@ -321,7 +321,7 @@ class Env(VecEnv):
             Observations by group; rewards [world]; whether the episode ended, int [world]; a dictionary with
             ``time_outs`` [world], 1 where it ended for its length alone, and now and then ``log``.
         """
-        self.actions.copy_(arguments.checked_actions("Env.step", actions, self.num_envs, self.action_labels))
+        self.actions.copy_(arguments.check_actions("Env.step", actions, self.num_envs, self.action_labels))
         self.replay()
         self._steps += 1
         self.write_failures()
@@ -336,7 +336,7 @@ class Env(VecEnv):
 
     def controls(self, actions: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return what actions set, "ctrl", "target_q" or "tau" [world, ...]; worlds remember them as their actions."""
-        self.actions.copy_(arguments.checked_actions("Env.controls", actions, self.num_envs, self.action_labels))
+        self.actions.copy_(arguments.check_actions("Env.controls", actions, self.num_envs, self.action_labels))
         self._after("act")
         self._launch("act")
         return {name: controls.clone() for name, controls in self._controls.items()}

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
 
 from .commands import HELD
+from .compile.memory_layout import count_steps
 from .environment import Env
 
 Policy = Callable[[Any], torch.Tensor]
@@ -71,7 +73,7 @@ def balance(env: Env, policy: Policy) -> dict[str, float]:
     """Return how many worlds hold the pole within 0.1 rad for 90 % of an episode's last 5 s, and the least share."""
     steps = env.max_episode_length - 1
     found = roll(env, policy, steps, {"angle": lambda env: env.q[:, 1]})
-    last = round(5.0 / env.step_dt)
+    last = count_steps(5.0, env.step_dt)
     angle = torch.remainder(found["angle"][-last:] + torch.pi, 2 * torch.pi) - torch.pi
     share = ((angle.abs() < 0.1) & found["valid"][-last:]).float().mean(dim=0)
     return {"worlds": env.num_envs, "upright": int((share >= 0.9).sum()), "least share": float(share.min())}
@@ -84,12 +86,17 @@ def speed(env: Env, policy: Policy) -> dict[str, float]:
             "early ends": float(found["ended"].float().mean())}  # fmt: skip
 
 
-def reach(env: Env, policy: Policy, frame: str, period: float) -> dict[str, float]:
-    """Return the share of places that a frame has reached within 1 cm when the next is named, and errors [m]."""
+def reach(env: Env, policy: Policy, frame: str) -> dict[str, float]:
+    """Return the share of places that a frame has reached within 1 cm when the next is named, and errors [m].
+
+    Places of the first episode of each world are counted, but the last, which no other follows.
+    """
     pose = lambda env: env.dyn.frame_poses(env.q, [frame])[:, 0, :3]  # noqa: E731
     read = {"error": lambda env: (pose(env) - env.command).norm(dim=1), "command": lambda env: env.command}
     found = roll(env, policy, env.max_episode_length - 1, read)
-    changes = (found["command"][1:] != found["command"][:-1]).any(dim=2)
+    changes = (found["command"][1:] != found["command"][:-1]).any(dim=2) & found["valid"][1:]
+    if not changes.any():
+        return {"places": 0, "within 1 cm": math.nan, "median error": math.nan, "95 % error": math.nan}
     last = found["error"][:-1][changes]
     return {"places": int(changes.sum()), "within 1 cm": float((last < 0.01).float().mean()),
             "median error": float(last.median()), "95 % error": float(last.quantile(0.95))}  # fmt: skip
@@ -109,7 +116,7 @@ def tracking(env: Env, policy: Policy, seconds: float = 20.0, command: Any = Non
     """
     wanted = lambda env: env.command.clone()  # noqa: E731
     read = {"rates": base_rates, "wanted": wanted, "height": lambda env: env.q[:, 2]}
-    found = roll(env, policy, round(seconds / env.step_dt) - 1, read, command)
+    found = roll(env, policy, count_steps(seconds, env.step_dt) - 1, read, command)
     error, valid = found["rates"] - found["wanted"], found["valid"]
     return {
         "worlds": env.num_envs,
@@ -129,7 +136,7 @@ def climb(env: Env, policy: Policy, seconds: float = 15.0, way: float = 3.2) -> 
         start.append(env.q[:, :3].clone())
         return (env.q[:, :3] - start[0])[:, :3]
 
-    found = roll(env, policy, round(seconds / env.step_dt), {"place": place})
+    found = roll(env, policy, count_steps(seconds, env.step_dt), {"place": place})
     far = (found["place"][..., :2].norm(dim=2) > way) & (found["place"][..., 2] > 0.2) & found["valid"]
     return {"worlds": env.num_envs, "climbed": float(far.any(dim=0).float().mean())}
 

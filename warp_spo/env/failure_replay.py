@@ -123,7 +123,7 @@ class Failure:
         first are looked at first: actions, the state, the scene's values, what the world remembers, terms in torch.
         """
         for i in range(self.steps):
-            for name, values in self._named(i):
+            for name, values in self._iterate_values(i):
                 wrong = ~(np.abs(values) <= 1e30)
                 if wrong.any():
                     entry = int(np.flatnonzero(wrong)[0])
@@ -156,7 +156,7 @@ class Failure:
         )
         return "\n".join(lines)
 
-    def _named(self, i: int) -> Iterator[tuple[str, np.ndarray]]:
+    def _iterate_values(self, i: int) -> Iterator[tuple[str, np.ndarray]]:
         """Yield names and numbers of what was there before step i of the file, and its actions, first what counts."""
         arrays = {name: x[i].double().numpy().ravel() for name, x in self.arrays.items() if name not in LEFT_OUT}
         values = [name for name in arrays if name.startswith("value_")]

@@ -104,7 +104,7 @@ class FailureRing:
     """
 
     def __init__(self, env: Env, folder: str | Path):
-        self.folder = checked_folder(folder)
+        self.folder = check_failure_folder(folder)
         self.files: list[Path] = []
         self._device, self._wp_device, self._stream = env.device, env.warp_device, env._stream
         self.status = torch.zeros(env.num_envs, dtype=torch.int32, device=env.device)
@@ -114,7 +114,7 @@ class FailureRing:
         self._first_world, self._first_step, self._seed = env.first_world, env._steps, env.seed
         self._guard = list(env._layout.guard.names)
         last = max(self._arrays.values(), key=lambda each: each.first)
-        self._words = _rounded(last.first + last.tensor.nbytes // WORD)
+        self._words = _round_up(last.first + last.tensor.nbytes // WORD)
         self._fault = env._tensors[FAULT]
         self._make_memory(env.num_envs)
         self.clear()
@@ -133,7 +133,7 @@ class FailureRing:
         at = 0
         for name, (tensor, axis) in every.items():
             found[name] = RingArray(tensor, axis, at)
-            at = _rounded(at + tensor.nbytes // WORD)
+            at = _round_up(at + tensor.nbytes // WORD)
         return found
 
     def _make_memory(self, worlds: int) -> None:
@@ -356,7 +356,7 @@ def scene_of_rows(scene: Scene, rows: list[int]) -> Scene:
     return found
 
 
-def checked_folder(folder: Any) -> Path:
+def check_failure_folder(folder: Any) -> Path:
     """Return a folder in which files can be written.
 
     Raises:
@@ -378,5 +378,5 @@ def checked_folder(folder: Any) -> Path:
     return path
 
 
-def _rounded(words: int) -> int:
+def _round_up(words: int) -> int:
     return math.ceil(words / kernels.QUAD) * kernels.QUAD

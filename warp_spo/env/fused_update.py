@@ -102,8 +102,8 @@ class FusedUpdate:
         shapes = [tuple(weight.shape) for weight in parameters]
         for i, weight in enumerate(parameters):
             if any(weight is model.mlp[0].weight for model in models):
-                shapes[i] = len(weight), padded(weight.shape[1], WIDE)
-        sizes = [padded(math.prod(shape), ALIGNED) for shape in shapes]
+                shapes[i] = len(weight), round_up(weight.shape[1], WIDE)
+        sizes = [round_up(math.prod(shape), ALIGNED) for shape in shapes]
         self.border, end = sum(sizes[: len([*models[0].parameters()])]), sum(sizes)
         flat = [torch.zeros(end, device=device) for _ in range(4)]
         self.weights, self.gradients, self.first, self.second = flat
@@ -145,7 +145,7 @@ class FusedUpdate:
         self.value_sums, self.entropies = torch.zeros(count, 2, device=device), torch.zeros(count, device=device)
         self.norms, self.corrections = torch.zeros(2, device=device), torch.zeros(2, device=device)
 
-    def learned(self) -> list[torch.Tensor]:
+    def learned_tensors(self) -> list[torch.Tensor]:
         """Return the tensors that steps change."""
         return [self.weights, self.first, self.second, self.steps]
 
@@ -177,7 +177,7 @@ class FusedUpdate:
     def _inputs(self, latent: torch.Tensor) -> torch.Tensor:
         """Return inputs of a network in the dtype of products, filled up with zeros."""
         count = latent.shape[1]
-        return nn.functional.pad(latent.to(self.dtype), (0, padded(count, WIDE) - count))
+        return nn.functional.pad(latent.to(self.dtype), (0, round_up(count, WIDE) - count))
 
     @torch.no_grad()
     def learn(self, held: Sequence[Any]) -> None:
@@ -256,7 +256,7 @@ def start_compiling(device: str) -> None:
         _compiling.append(thread)
 
 
-def padded(count: int, size: int) -> int:
+def round_up(count: int, size: int) -> int:
     """Return the next multiple of a size."""
     return -(-count // size) * size
 

@@ -76,7 +76,7 @@ def make_vector(env: Env, tensors: bool = False, autoreset_mode: Any = "SameStep
                 env.reset(mask, seed)
                 self._waiting = torch.zeros_like(self._waiting)
             else:
-                mask = arguments.checked_mask("reset: options['reset_mask']", mask, env.num_envs, env.device)
+                mask = arguments.check_mask("reset: options['reset_mask']", mask, env.num_envs, env.device)
                 env.reset(mask & ~self._waiting)  # those that wait have started anew
                 self._waiting = self._waiting & ~mask
             if not isinstance(seed, list | tuple | np.ndarray):
@@ -201,9 +201,9 @@ def make_skrl(env: Env, observations: str | None = None, states: str | None = No
     from skrl.envs.wrappers.torch import Wrapper
 
     groups = list(env.num_obs)
-    own = observations or groups[0]
-    whole = states or (groups[1] if len(groups) > 1 and observations is None else None)
-    for name in (own, whole):
+    policy_group = observations or groups[0]
+    critic_group = states or (groups[1] if len(groups) > 1 and observations is None else None)
+    for name in (policy_group, critic_group):
         if name is not None and name not in groups:
             raise ValueError(f"env.skrl: unknown group {name!r}; expected one of {', '.join(map(shown, groups))}")
     box = spaces_of(env)[1]
@@ -217,11 +217,11 @@ def make_skrl(env: Env, observations: str | None = None, states: str | None = No
 
         @property
         def observation_space(self) -> Any:
-            return self._space(own)
+            return self._space(policy_group)
 
         @property
         def state_space(self) -> Any:
-            return self._space(whole)
+            return self._space(critic_group)
 
         @property
         def action_space(self) -> Any:
@@ -233,18 +233,18 @@ def make_skrl(env: Env, observations: str | None = None, states: str | None = No
 
         def reset(self) -> tuple[Any, dict]:
             """Return the present observations; worlds start anew by themselves."""
-            return self._seen[own], {}
+            return self._seen[policy_group], {}
 
         def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Any]:
             """Take a step."""
             self._seen, rewards, done, extras = env.step(actions)
-            late = extras["time_outs"].bool()
-            ends = (done.bool() & ~late, late)
-            return self._seen[own], rewards.view(-1, 1), *(each.view(-1, 1) for each in ends), extras
+            timed_out = extras["time_outs"].bool()
+            ends = (done.bool() & ~timed_out, timed_out)
+            return self._seen[policy_group], rewards.view(-1, 1), *(each.view(-1, 1) for each in ends), extras
 
         def state(self) -> Any:
             """Return the observations of the group ``states``; None without one."""
-            return None if whole is None else self._seen[whole]
+            return None if critic_group is None else self._seen[critic_group]
 
         def render(self, *_: Any, **__: Any) -> Any:
             """Do nothing."""

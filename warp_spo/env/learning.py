@@ -24,7 +24,7 @@ from ..runtime.arrays import parse_device
 from . import training_files
 from .captured_ppo import CapturedPPO
 from .environment import Env
-from .loggers import checked
+from .loggers import check_loggers
 from .runner import Runner, describe_end, load_checkpoint, run
 from .startup import PRECISIONS
 from .training_log import TrainingLog
@@ -191,13 +191,13 @@ def prepare(
     folder = Path(folder)
     if str(resume) == training_files.LATEST:
         resume = training_files.newest(folder)  # None: a training that begins
-    runner = make_runner(env, learner, folder, save_interval, every, began, seconds, checked(loggers))
+    runner = make_runner(env, learner, folder, save_interval, every, began, seconds, check_loggers(loggers))
     first = load_checkpoint(runner, resume) + 1 if resume is not None else 0
     runner.logger.first = first  # type: ignore[attr-defined]
     total = learner.iterations if iterations is None else iterations
     if first >= total:
-        has = "no checkpoint" if resume is None else repr(str(resume))
-        raise ValueError(f"train: {has} has {first} iterations, and {total} are asked for in all; expected more")
+        source = "no checkpoint" if resume is None else repr(str(resume))
+        raise ValueError(f"train: {source} has {first} iterations, and {total} are asked for in all; expected more")
     folder.mkdir(parents=True, exist_ok=True)
     runner.logger.init_logging_writer()
     return runner, total - first

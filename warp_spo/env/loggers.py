@@ -105,7 +105,7 @@ class WandbLogger:
 KINDS = {"tensorboard": TensorBoardLogger, "wandb": WandbLogger}
 
 
-def checked(names: Sequence[str] | None) -> list[str]:
+def check_loggers(names: Sequence[str] | None) -> list[str]:
     """Return names of loggers; None: TensorBoard where it is installed.
 
     Raises:

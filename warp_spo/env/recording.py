@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +13,9 @@ import torch
 
 from ..scene.scene import Scene
 from ..viewing import films, shapes
+from ..viewing.appearance import file_appearance
 from . import robots
+from .compile.memory_layout import count_steps
 from .environment import Env
 from .evaluation import hold
 from .validation import check_number, check_whole
@@ -51,7 +54,7 @@ def record(env: Env, policy: Any, seconds: float, command: Any = None, world: in
     with hold(env, command):
         observed, _ = env.reset()
         env.episode_length_buf = torch.zeros_like(env.episode_length_buf)
-        for _ in range(round(seconds / env.step_dt)):
+        for _ in range(count_steps(seconds, env.step_dt)):
             observed, _, _, _ = env.step(policy(observed))
             for rows, values in zip(states, (env.q, env.qd, env.command if commanded else env.q), strict=True):
                 rows.append(values[world].cpu().numpy().copy())
@@ -61,11 +64,12 @@ def record(env: Env, policy: Any, seconds: float, command: Any = None, world: in
 
 def play(
     env: Env, policy: Any, path: str | Path, seconds: float = 8.0, command: Any = None,
-    camera: films.Camera | None = None, suffix: str = ".gif",
+    camera: films.Camera | None = None, suffix: str = ".gif", robot: str | Path | None = None,
 ) -> list[Path]:  # fmt: skip
     """Let a policy act in any environment, and draw world 0: write a film and a strip of ten pictures as PNG.
 
-    Shapes come from the scene: what touches the ground, and a bone from each joint to the next. All worlds start anew.
+    Shapes are those that the robot's file draws; without a file those of the scene, what touches the ground and a bone
+    from each joint to the next. All worlds start anew.
 
     Args:
         env: the environment. policy: function from observations to actions.
@@ -73,6 +77,7 @@ def play(
         seconds: of the film. command: held if it is given, one number for each of the environment's commands.
         camera: None: one that sees all of the robot, from the side; it follows a floating base.
         suffix: of the film: ".gif", ".webp", or ".mp4", which needs imageio-ffmpeg.
+        robot: URDF, MJCF or USD file of the scene's robot; what cannot be read of it is a warning.
 
     Returns:
         The files: the film, the strip.
@@ -86,7 +91,12 @@ def play(
         )
     recorded, start = record(env, policy, seconds, command), env.default_q
     scene = env.scene.without_loops()
-    drawn = shapes.primitives(scene, start)
+    drawn: Any = shapes.primitives(scene, start)
+    if robot is not None:
+        found = file_appearance(Path(robot), scene)
+        for note in found.notes:
+            warnings.warn(f"recording.play: {str(robot)!r}: {note}", stacklevel=2)
+        drawn = found.drawn
     camera = films.camera_of(scene, start) if camera is None else camera
     follow = scene.hinges[0].coord_count == 7
     every = list(range(0, len(recorded.q), STEPS_A_PICTURE))
@@ -146,7 +156,7 @@ def captions(recorded: Rollout, rows: Sequence[int]) -> list[str]:
 
 
 def _draw(
-    scene: Scene, drawn: Sequence[shapes.Primitive], camera: films.Camera, follow: bool, recorded: Rollout,
+    scene: Scene, drawn: Sequence[Any], camera: films.Camera, follow: bool, recorded: Rollout,
     rows: Sequence[int], texts: list[str], beside: list,
 ) -> list:  # fmt: skip
     """Return a picture of each row; a camera that follows looks from the side of where the robot faces at first."""

@@ -106,8 +106,8 @@ def split(tree: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     return dict(learner), {name: value for name, value in tree.items() if name not in ("learner", *ABOUT)}
 
 
-def changed(held: Any, given: Any, place: str) -> Any:
-    """Return something with settings in its place or in its parts.
+def apply(held: Any, given: Any, place: str) -> Any:
+    """Return ``held`` with the settings ``given`` in its place or in its parts.
 
     Parts are the entries of dictionaries, the fields of dataclasses, and the entries of lists by number; of a reward,
     which is (weight, term), the weight, which may have parts itself.
@@ -118,13 +118,13 @@ def changed(held: Any, given: Any, place: str) -> Any:
     if isinstance(given, Mapping):
         parts = _parts(held)
         if not parts and _is_reward(held):
-            return changed(held[0], given, place), held[1]  # its weight is a curriculum
+            return apply(held[0], given, place), held[1]  # its weight is a curriculum
         if not parts:
             raise ValueError(f"settings: {place} is {_short(held)}, which has no {', '.join(map(str, given))}")
         new = {}
         for name, value in given.items():
-            key = _known(str(name), parts, place)
-            new[key] = changed(parts[key], value, f"{place}.{key}")
+            key = _find_name(str(name), parts, place)
+            new[key] = apply(parts[key], value, f"{place}.{key}")
         return _with_parts(held, new, place)
     if _is_reward(held) and dataclasses.is_dataclass(held[0]):
         return _alike(given, 1.0, place), held[1]
@@ -151,8 +151,8 @@ def make_env(scene: Any, worlds: int, device: Any, options: Mapping[str, Any], *
     known = list(inspect.signature(Env.__init__).parameters)[2:]
     found = dict(own)
     for name, value in options.items():
-        name = _known(name, dict.fromkeys([*own, *known]), "")
-        found[name] = changed(own[name], value, name) if name in own else value
+        name = _find_name(name, dict.fromkeys([*own, *known]), "")
+        found[name] = apply(own[name], value, name) if name in own else value
     env = Env(scene, worlds, device, **found)
     env.options = dict(options)
     return env
@@ -170,9 +170,9 @@ def arguments(chosen: Any, given: Mapping[str, Any]) -> dict[str, Any]:
                 f"settings: {name} is {value!r}; expected it as an option, such as --seed, or learner.{name}"
             )
         if name not in own and inspect.Parameter.VAR_KEYWORD not in kinds:
-            name = _known(name, own, "")
+            name = _find_name(name, own, "")
         default = own.get(name)
-        found[name] = value if default is None or name not in own else changed(default, value, name)
+        found[name] = value if default is None or name not in own else apply(default, value, name)
     return found
 
 
@@ -218,7 +218,7 @@ def _with_parts(held: Any, new: Mapping[Any, Any], place: str) -> Any:
         raise ValueError(f"settings: {place}: {error}") from None
 
 
-def _known(name: str, known: Mapping[str, Any], place: str) -> str:
+def _find_name(name: str, known: Mapping[str, Any], place: str) -> str:
     """Return a name as it is known, where "_" may stand for a space."""
     spaced = {str(each).replace(" ", "_"): each for each in known}
     if name in known or name.replace(" ", "_") in spaced:

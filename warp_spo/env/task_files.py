@@ -18,14 +18,14 @@ GROUP = "warp_spo.tasks"  # of entry points: NAME = "package.module", a module w
 START = "python -m warp_spo.tasks --new my_task.py writes a file to start from"
 
 
-def registered() -> dict[str, metadata.EntryPoint]:
+def find_registered() -> dict[str, metadata.EntryPoint]:
     """Return the tasks that installed packages register, by name."""
     return {each.name: each for each in metadata.entry_points(group=GROUP)}
 
 
 def short_name(name: str) -> str:
     """Return what a task's folder is called: a ready or registered name, the name of a file, or of a module."""
-    return Path(name).stem if is_file(name) else name if name in registered() else name.split(".")[-1]
+    return Path(name).stem if is_file(name) else name if name in find_registered() else name.split(".")[-1]
 
 
 def is_file(name: str) -> bool:
@@ -39,13 +39,13 @@ def load(name: str, ready: dict[str, str]) -> Any:
     Raises:
         ValueError: there is none, it cannot be imported, or it lacks something; the message says where.
     """
-    others = registered()
+    others = find_registered()
     if is_file(name):
         chosen = _from_file(Path(name))
     elif name in others:
-        chosen = _imported(f"task {name!r}, which is {others[name].value}", others[name].load)
+        chosen = _import(f"task {name!r}, which is {others[name].value}", others[name].load)
     elif "." in name or _is_module(name):
-        chosen = _imported(f"module {name!r}", lambda: importlib.import_module(name))
+        chosen = _import(f"module {name!r}", lambda: importlib.import_module(name))
     else:
         names = [*ready, *others]
         near = difflib.get_close_matches(name, names, 1)
@@ -208,10 +208,10 @@ def _from_file(path: Path) -> ModuleType:
         loader.exec_module(module)
         return module
 
-    return _imported(str(path), run)
+    return _import(str(path), run)
 
 
-def _imported(what: str, run: Any) -> Any:
+def _import(what: str, run: Any) -> Any:
     """Return what an import returns; its errors become one line, with the last line of the user's that it ran."""
     try:
         return run()

@@ -94,7 +94,7 @@ class DifferentialIK:
         if w._stage.name != "act":  # where an episode starts its action is to stay
             found = q
         else:
-            found = q + self._change(w, hinges, q, action)
+            found = q + self._joint_steps(w, hinges, q, action)
         values = through.gears(w) * (found - w.encoder_bias(hinges))
         return list(zip(through.entries(w.scene), values, strict=True))
 
@@ -113,22 +113,22 @@ class DifferentialIK:
                 "with position servos (through=actions.Control(...)) or drives (through=actions.Position(...))"
             )
 
-    def _change(self, w: World, hinges: list[int], q: Vector, action: Vector) -> Vector:
-        """Return what the joints' targets are beyond their coordinates."""
+    def _joint_steps(self, w: World, hinges: list[int], q: Vector, action: Vector) -> Vector:
+        """Return target - coordinate of each joint; the file's class has the formula."""
         dofs = [int(w.scene.qd_start[hinge]) for hinge in hinges]
-        missing = self._missing(w, action)
-        J = w.jacobian(self.frame)[: len(missing)][:, dofs]
+        error = self._pose_error(w, action)
+        J = w.jacobian(self.frame)[: len(error)][:, dofs]  # a position has the rows of the velocity, which come first
         default = w.default_q[[int(w.scene.q_start[hinge]) for hinge in hinges]]
-        free = self.rest * (default - q) if self.rest else vector(0.0 for _ in q)
+        null_space_step = self.rest * (default - q) if self.rest else vector(0.0 for _ in q)
         if self.rest:
-            missing = missing - J @ free
+            error = error - J @ null_space_step
         A = J @ J.T
-        for i in range(len(missing)):
+        for i in range(len(error)):
             A[i, i] = A[i, i] + self.damping**2
-        return free + J.T @ solve_positive(A, missing)
+        return null_space_step + J.T @ solve_positive(A, error)
 
-    def _missing(self, w: World, action: Vector) -> Vector:
-        """Return the translation, and the rotation vector, that the frame shall do, inertial axes."""
+    def _pose_error(self, w: World, action: Vector) -> Vector:
+        """Return what the frame lacks: a translation [m], then for a pose a rotation vector [rad], inertial axes."""
         labels = self.labels(w.scene)
         scale, offset = (spread("DifferentialIK", name, getattr(self, name), labels) for name in ("scale", "offset"))
         limited = action if self.clip is None else [clip(x, *self.clip) for x in action]
@@ -136,15 +136,15 @@ class DifferentialIK:
         if self.relative:
             return numbers
         wanted, frame = numbers + offset, w.frame(self.frame)
-        away = wanted[:3] - frame.position
+        translation = wanted[:3] - frame.position
         if self.kind == "position":
-            return away
+            return translation
         x, y, z, s = frame.quaternion
         turn = multiply(wanted[3:], vector([-x, -y, -z, s]))
         turn = vector(where(turn[3] < 0.0, -each, each) for each in turn)  # the shorter way
         sine = np.sqrt(sum(each * each for each in turn[:3]) + 1e-20)
         angle = 2.0 * np.arctan2(sine, turn[3])
-        return np.concatenate([away, turn[:3] * (angle / sine)])
+        return np.concatenate([translation, turn[:3] * (angle / sine)])
 
 
 def solve_positive(A: Any, b: Vector) -> Vector:

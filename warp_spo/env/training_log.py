@@ -57,7 +57,7 @@ class TrainingLog:
         file = Path(self.log_dir) / "progress.jsonl"  # type: ignore[arg-type]
         if file.exists():
             self.rows = [row for row in read_rows(file) if row["iteration"] < self.first]
-            text = lines_of(self.rows)
+            text = to_json_lines(self.rows)
             write_bytes(file, text)
             self._size = len(text)
         if self.rows:
@@ -97,7 +97,7 @@ class TrainingLog:
         }
         row["reward"] = sum(value for name, value in row.items() if name.startswith("/reward/"))
         self.rows.append(row)
-        self._append(lines_of([row]))
+        self._append(to_json_lines([row]))
         self._log_elsewhere(row, it)
         if it % self.every == 0 or it + 1 == total_it:
             reward = f"{row['reward']:8.3f}" if row["/episode/finished"] else f"{'-':>8}"
@@ -133,7 +133,7 @@ class TrainingLog:
         try:
             with self.file.open("ab", buffering=0) as out:  # type: ignore[union-attr]
                 if out.tell() < self._size:  # another file: that one is lost
-                    self._size, self._waiting = 0, lines_of(self.rows)
+                    self._size, self._waiting = 0, to_json_lines(self.rows)
                 out.truncate(self._size)
                 while self._waiting:
                     done = out.write(self._waiting)
@@ -181,13 +181,17 @@ def peak_memory(device: Any) -> dict[str, float]:
     )
 
 
-def lines_of(rows: list[dict[str, float]]) -> bytes:
-    """Return rows as the lines of a ``progress.jsonl``, without the terms that ended no world as not finite."""
+def to_json_lines(rows: list[dict[str, float]]) -> bytes:
+    """Return rows as the lines of a ``progress.jsonl``.
 
-    def told(name: str, value: float) -> bool:
+    A row counts by term the worlds that ended because a number was not finite or beyond its bounds; terms that count
+    zero are left out, the totals stay.
+    """
+
+    def is_logged(name: str, value: float) -> bool:
         return value != 0.0 or name.count("/") < 3 or not name.startswith(KINDS_OF_FAULTS)
 
-    kept = ({name: float(f"{x:.6g}") for name, x in row.items() if told(name, x)} for row in rows)
+    kept = ({name: float(f"{x:.6g}") for name, x in row.items() if is_logged(name, x)} for row in rows)
     return "".join(json.dumps(row) + "\n" for row in kept).encode()
 
 

@@ -155,7 +155,7 @@ class World:
         remembered = self.memory(name, 1, reset=None)[0]
         layout.levels.setdefault(name, value.level)
         if self._stage.name == "judge" and layout.judged is not None:
-            remembered = layout.grown(name)
+            remembered = layout.update_level(name)
         return value.value(value.level.value(remembered))
 
     def episode_mean(self, call: str, term: str) -> tuple[Any, Any]:
@@ -333,14 +333,16 @@ class World:
 
     # -- ground ----------------------------------------------------------------------------------------------------
     def ground_height(self, x: Any, y: Any) -> Any:
-        """Return the height of the scene's ground at a point of the horizontal plane [m], inertial axes."""
+        """Return the height of the scene's ground at a point (x, y) [m] of the horizontal plane, inertial axes [m]."""
         if self.scene.ground is None:
             raise ValueError("World.ground_height: the scene has no ground; expected scene.with_contacts(..., ground)")
         origin, field = self.value("ground_origin"), self.value("ground_field")
         moved = [as_value(each) for each in origin] if len(origin) else [0.0] * 3
         place = GroundOffset(spatial.Vector(moved), as_value(field[0]) if len(field) else 0.0)
         stage, ground = self._stage, self.scene.ground
-        return AbstractScalar(height(stage.graph, ground, as_value(x), as_value(y), place, together=not stage.rows))
+        return AbstractScalar(
+            height(stage.graph, ground, as_value(x), as_value(y), place, by_cell_table=not stage.rows)
+        )
 
     def table(self, name: str, numbers: np.ndarray) -> Callable[[Any], Vector]:
         """Return a function from a row, a whole number, to that row of a table of numbers [row, n].

@@ -123,6 +123,12 @@ class Plan:
         return chosen if routine.has_node_form else "tree"
 
     def _rule(self, routine: Routine) -> str:
+        """Return the granularity that measured rules give a routine which has all forms; the first that applies.
+
+        The plan's own granularity where the tree is not cut into several chains, or into too many for the warps of a
+        block. Chains may divide work that spills the registers of one thread, and they cost barriers: "tree" where a
+        thread holds the whole tree, "segment" where it does not, or where a GPU has too few worlds to fill it.
+        """
         if self.granularity == "node" or self.leaf_segments == 1 or self.leaf_segments > MOST_WARPS:
             return self.granularity
         if routine.couples_bodies:
@@ -130,10 +136,8 @@ class Plan:
             return "segment" if few else "tree"
         if routine.is_counted and not self.segments_share_code and self.dofs <= HELD:
             return "tree"
-        if (
-            routine.hints.long_result or routine.passes is not None or routine.hints.crowded
-        ):  # a thread holds too little even of a dozen dofs
-            return "segment"
+        if routine.hints.long_result or routine.passes is not None or routine.hints.crowded:
+            return "segment"  # a thread holds too little even of a dozen dofs
         if self.granularity == "segment" and not self.latency_bound:
             if routine.hints.short or (not routine.hints.velocities and self.dofs <= SOLVES[self.dtype]):
                 return "tree"

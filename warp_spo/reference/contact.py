@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .dense import Dense
+from .field_cells import cell_at, cell_corners
 from .field_grid import find, touched
 from .field_spheres import nearest_points
 from .rotations import homogeneous
@@ -230,18 +231,19 @@ def surfaces(field, at, number=0, moves=(0.0, 0.0, 0.0), walls=True):
     """Return normal and depth of the surfaces of a height field near a point that the step takes by ``moves``.
 
     They are the field's own, or a floor and a wall where the middle slope of the cell exceeds 1. The wall ends at the
-    highest corner. A cell without a wall is followed by the wall of the cell where the step takes the point, if that
-    rises along ``moves``. Of a set of fields it is that of this number. Without ``walls`` they are the field's own.
+    highest corner. Beyond an edge the field is level across it. A cell without a wall is followed by the wall of the
+    cell where the step takes the point, if that rises along ``moves``. Of a set of fields it is that of this number.
+    Without ``walls`` they are the field's own.
     """
     h, place = field.heights.reshape(-1, *field.heights.shape[-2:])[number], at[:2] - field.origin[:2]
-    place, ahead = (np.clip(x / field.cell, 0.0, np.array(h.shape) - 1.0) for x in (place, place + moves[:2]))
+    place, ahead = place / field.cell, (place + moves[:2]) / field.cell
     z = at[2] - field.origin[2]
     upward = lambda slope: np.array([*-slope, 1.0]) / np.sqrt(1.0 + slope @ slope)  # noqa: E731
 
     def cell(inside):
         """The corners of the cell, its slope in the middle, and where ``place`` is in it."""
-        first = np.minimum(inside.astype(int), np.array(h.shape) - 2)
-        corners = h[first[0] : first[0] + 2, first[1] : first[1] + 2]
+        first = cell_at(inside, h.shape)
+        corners = cell_corners(h, first)
         middle = np.array([corners[1] - corners[0], corners[:, 1] - corners[:, 0]]).mean(axis=1) / field.cell
         return corners, middle, place - first
 
@@ -357,6 +359,10 @@ class ContactStep:
                 up = upward(ground, middle - moved, which)
             grid = self._grid_touch(point, middle, moved, which)
             seat, hub, more = self._support_place(point, up, path) if grid is None else (grid[2], grid[2], 0.0)
+            is_there = grid is not None or point.support is None or self._is_there(point, up)
+            if point.support is not None and not plane and point.support.kind == "hull corner":
+                *place, is_there = self._field_row(point, middle, moved, which)
+                seat = hub = point.position + np.array(point.support.axes).T @ place
             at = (dense.body_matrix[point.body] @ homogeneous([*seat, 0, 0, 0, 1]))[:3, 3]
             bending = dense.jacobian_bias(path, [(point.body, (*hub, 0, 0, 0, 1))])[0, :3]
             share = 0.5 if self.half_way else 1.0
@@ -379,9 +385,7 @@ class ContactStep:
                 touches = nearest_points(ground, at - moved, point.radius, which, point.walls and self._touches_twice)
             else:
                 touches = surfaces(ground, at - moved, which, moves, point.walls)
-            if point.support is not None and grid is None:
-                there = point.support.is_there(dense.body_matrix[point.body][:3, :3].T @ up)
-                touches = [(normal, depth if there else AWAY) for normal, depth in touches]
+            touches = [(normal, depth if is_there else AWAY) for normal, depth in touches]
             for normal, depth in touches:
                 at = centre - point.radius * normal if rolls else at
                 J, bend = dense._jacobian_at(point.body, at), normal @ bending + more
@@ -406,13 +410,23 @@ class ContactStep:
         pose, start, cell = self.dense.body_matrix[point.body], np.array(ground.origin) + moved, np.array(ground.cells)
         axes, shape = np.array(support.axes) @ pose[:3, :3].T, support.kind.partition(" ")[0]
         heights = ground.heights.reshape(-1, *ground.heights.shape[-2:])
-        numbers = [which * heights[0].size, *(middle - start), *axes.ravel(), *support.sizes, *cell, *heights[0].shape]
-        numbers += support.table
-        row = find(shape, heights.ravel(), numbers)[support.number]
+        row = self._field_row(point, middle, moved, which)
         found = touched(shape, heights[which], cell, middle - start, axes, support.sizes, point.radius, row)
         if found is None:
             return np.array([0.0, 0.0, 1.0]), AWAY, np.array(point.position)
         return *found[:2], pose[:3, :3].T @ (found[2] + start - pose[:3, 3])
+
+    def _field_row(self, point, middle, moved, which):
+        """Return the row that a search in the field finds for a point of a shape."""
+        support, ground, turn = point.support, self.scene.ground, self.dense.body_matrix[point.body][:3, :3]
+        shape = "corners" if support.kind == "hull corner" else support.kind.partition(" ")[0]
+        heights = ground.heights.reshape(-1, *ground.heights.shape[-2:])
+        numbers = [which * heights[0].size, *(middle - ground.origin - moved), *(support.axes @ turn.T).ravel()]
+        numbers += [*support.sizes, *ground.cells, *heights[0].shape, *support.table]
+        return find(shape, heights.ravel(), numbers)[support.number]
+
+    def _is_there(self, point, up):
+        return point.support.is_there(self.dense.body_matrix[point.body][:3, :3].T @ up)
 
     def _support_place(self, point, up, path):
         """Return a point that moves over its shape, the material one whose path counts, and its further bend.

@@ -11,6 +11,7 @@ What is found is discrete: which point or line, and which face or edge. Where it
 
 import numpy as np
 
+from . import hull_corners
 from .field_spheres import find_cells
 
 ROW = 9  # numbers of a row: its kind, i, j of a grid point, a direction and a place on the shape, in its axes
@@ -30,10 +31,13 @@ PARALLEL = 1e-6  # square of the sine below which an axis and a grid line are pa
 def find(shape, heights, numbers):
     """Return the rows [QUADRANTS, ROW] of a shape: "box", "capsule", "hull", "cylinder"; "sphere": see :func:`_sphere`.
 
+    Of "corners", those of a hull that touch, rows are :func:`.hull_corners.on_field`.
+
     Args:
         heights: of all fields, row after row. numbers: of the first height of the field; the shape's middle from there
             (3) [m]; its axes, one a row (9); its sizes (3) [m]; the cell along x and y [m]; points along x and y; of
-            a hull the number of faces, their normals and distances from the middle, and the edges, see _polyhedron.
+            a hull the number of faces, their normals and distances from the middle, and the edges, see _polyhedron;
+            of corners these, along the axes.
     """
     numbers = np.asarray(numbers, dtype=np.float64)
     if shape == "sphere":
@@ -42,6 +46,8 @@ def find(shape, heights, numbers):
     counts = counts.astype(int)
     field = heights[int(first[0]) :][: counts[0] * counts[1]].reshape(counts)
     axes = axes.reshape(3, 3)
+    if shape == "corners":
+        return hull_corners.on_field(field, cell, centre, axes, table.reshape(-1, 3))
     if _is_far(field, cell, centre, axes, sizes):
         return _choose([])
     return SHAPES[shape](field, cell, centre, axes, sizes, table)

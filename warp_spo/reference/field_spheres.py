@@ -2,7 +2,10 @@
 
 import numpy as np
 
+from .field_cells import cell_corners
+
 STEPS, REACH, APART = 2, 0.71, 0.94  # steps in a cell; sine of 45 degrees; cosine of 20 degrees
+NEARER = 1.0 - 1e-6  # of a square of a distance: what is less far counts as nearer than an earlier cell
 
 
 def nearest_points(field, centre, radius, number=0, both=True):
@@ -16,9 +19,9 @@ def nearest_points(field, centre, radius, number=0, both=True):
     start = centre - np.array(field.origin)
     ring = 1 if REACH * radius <= 0.5 * cell.min() else 2
     *cells, there = find_cells(h, start, cell, ring, both)
-    at = np.clip(start[:2] / cell, 0.0, np.array(h.shape) - 1.0)
+    at = np.clip(start[:2] / cell, -ring, np.array(h.shape) - 1.0 + ring)
     chosen = [np.array(cells[:2], dtype=int), np.array(cells[2:], dtype=int)][: 2 if both and there else 1]
-    surfaces = [_foot(h[i : i + 2, j : j + 2], (at - (i, j)) * cell, start[2], cell, STEPS + 1) for i, j in chosen]
+    surfaces = [_foot(cell_corners(h, (i, j)), (at - (i, j)) * cell, start[2], cell, STEPS + 1) for i, j in chosen]
     above = surfaces[0][1]
     signed = [(up if above else -up, np.linalg.norm(up) if above else -np.linalg.norm(up)) for up, _ in surfaces]
     return [(up / abs(distance), radius - distance) for up, distance in signed]
@@ -29,24 +32,35 @@ def find_cells(heights, centre, cell, ring, both):
 
     Args:
         heights: of one field [i, j]. centre: from its first point [m]. ring: how many cells to each side are tried.
+
+    Cells beyond the edges count, with numbers below zero or above those of the field's last ones. Cells that share the
+    nearest point, on their edge, are equally far but for rounding: of those the first counts, see NEARER.
     """
     most = np.array(heights.shape) - 1
-    at = np.clip(centre[:2] / cell, 0.0, most) if np.isfinite(centre).all() else np.zeros(2)
+    at = np.clip(centre[:2] / cell, -ring, most + ring) if np.isfinite(centre).all() else np.zeros(2)
     found = []
     for i in range(-ring, ring):
         for j in range(-ring, ring):
-            first = np.clip(np.floor(at + 0.5) + np.array((i, j)), 0, most - 1).astype(int)
-            corners = heights[first[0] : first[0] + 2, first[1] : first[1] + 2]
-            found.append((first, corners, (at - first) * cell))
+            first = (np.floor(at + 0.5) + np.array((i, j))).astype(int)
+            found.append((first, cell_corners(heights, first), (at - first) * cell))
     feet = [_foot(*each[1:], centre[2], cell, STEPS) for each in found]
-    best = int(np.argmin([away @ away for away, _ in feet]))
+    best = _first_nearest([away @ away for away, _ in feet])
     away, above = _foot(*found[best][1:], centre[2], cell, STEPS + 1)
     far = [
         other @ other if up and other @ away < APART * np.linalg.norm(other) * np.linalg.norm(away) else np.inf
         for other, up in feet
     ]
     there = bool(both and above and np.isfinite(min(far)))
-    return [*found[best][0], *(found[int(np.argmin(far))][0] if there else (0, 0)), float(there)]
+    return [*found[best][0], *(found[_first_nearest(far)][0] if there else (0, 0)), float(there)]
+
+
+def _first_nearest(squares):
+    """Return the number of the least square; of those that are as small but for rounding the first."""
+    best = 0
+    for number, square in enumerate(squares):
+        if square < NEARER * squares[best]:
+            best = number
+    return best
 
 
 def _foot(corners, inside, z, cell, steps):

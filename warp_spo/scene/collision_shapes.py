@@ -189,7 +189,7 @@ class ShapeSelection(NamedTuple):
             made = scene.with_contacts(contacts, ground)
             warn_of_overlaps(call, made, len(contacts) - len(touching))
             return made, left_out
-        except ValueError as error:  # of a contact, which knows neither the call nor the file
+        except (ValueError, TypeError) as error:  # of a contact, which knows neither the call nor the file
             if not str(error).startswith(call):
                 error.args = (f"{call}: {error}",)
             raise
@@ -229,12 +229,14 @@ class ShapeSelection(NamedTuple):
         return ([], selection.missed()) if self.pairs is None else selection.chosen(self.pairs)
 
     def wants(self, call: str) -> bool:
-        """Return whether contacts are wanted; ValueError for a ground without any."""
+        """Return whether contacts are wanted; ValueError for a ground without any, errors of patterns and points."""
         if self.contacts is None and self.ground is not None:
             raise ValueError(
                 f"{call}: ground is given without contacts; expected contacts='ground' or a pattern beside it; "
                 "scene.with_contacts takes contacts of your own"
             )
+        if self.contacts is not None:
+            self._patterns(call)
         return self.contacts is not None
 
     def resolve(
@@ -307,7 +309,7 @@ class ShapeSelection(NamedTuple):
         if not isinstance(patterns, Mapping) or not patterns or not all(isinstance(name, str) for name in patterns):
             raise TypeError(
                 f"{call}: contacts is {given!r}; expected 'ground', True, a pattern such as '*foot*', a list of "
-                "patterns, or points by pattern"
+                "patterns, or points by pattern; None, for no contacts"
             )
         for count in patterns.values():
             if (as_integer(count) or 0) < 1:

@@ -10,10 +10,13 @@ from typing import Any
 import numpy as np
 
 from ..errors import shown
+from ..reference.field_spheres import REACH
 from .contact_defaults import POINTS_AT_REST, NeutralPose
+from .ground import HeightField
 
 SOFT = 0.1  # share of its smallest size by which a body that sinks under its load is said
 NAMED = 4  # contacts in the message
+TRIED = 1.5  # cells to each side of a sphere's centre, at least, in which a field's nearest point is looked for
 UNITS = {"contact_stiffness": "N/m", "contact_damping": "N s/m"}
 
 
@@ -68,6 +71,29 @@ def warn_of_soft_contacts(call: str, scene: Any, neutral: NeutralPose) -> None:
         warnings.warn(
             f"{call}: stiffness of {len(found)} contact(s) is too small: at rest they sink by more than a tenth of "
             f"their size under what they carry ({'; '.join(words)}{more} [N/m]); give more, or leave stiffness out",
+            UserWarning,
+            stacklevel=4,
+        )
+
+
+def warn_of_large_spheres(call: str, scene: Any) -> None:
+    """Warn of spheres so large beside a field's cells that the nearest point of its slopes may not be looked at."""
+    field, points = scene.ground, scene.contact_points
+    if not isinstance(field, HeightField):
+        return
+    most = TRIED * min(field.cells) / REACH
+    large = [row for row, point in enumerate(points) if point.support is None and point.radius > most]
+    if not large:
+        return
+    slopes = [np.abs(np.diff(field.heights, axis=axis - 2)).max() / field.cells[axis] for axis in (0, 1)]
+    sine = np.sin(np.arctan(np.hypot(*slopes)))
+    large = [row for row in large if sine * points[row].radius > TRIED * min(field.cells)]
+    if large:
+        words = [f"{_words(scene, row)}: {points[row].radius:.3g} m" for row in large[:NAMED]]
+        more = f"; and {len(large) - NAMED} more" if len(large) > NAMED else ""
+        warnings.warn(
+            f"{call}: {len(large)} sphere(s) are larger than {most:.3g} m, 2.1 cells of the height field, and miss "
+            f"what is farther aside ({'; '.join(words)}{more}); give larger cells, or several smaller spheres",
             UserWarning,
             stacklevel=4,
         )

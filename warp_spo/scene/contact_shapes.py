@@ -219,7 +219,7 @@ class ContactShape(StoredPart):
         raise UnsupportedError(call, f"a {self.kind} in contact with another body", ways)
 
     def primitive(self, least: float) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
-        """Return what is drawn: "sphere", "capsule" or "box", its sizes as in a source [m], and its pose in the body.
+        """Return what is drawn: a kind of ``viewing.shapes.Primitive``, its sizes [m], and its pose in the body.
 
         ``least``: smallest radius that is drawn [m].
         """
@@ -462,7 +462,7 @@ class CylinderShape(ContactShape):
 
     def primitive(self, least: float) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
         segment, radius = _swept_segment(self.ends[0], self.ends[1], 0.0), max(*self.radii, FLAT)
-        return "box", (radius, radius, max(float(segment.size[2]), FLAT)), tuple(segment.pose.tolist())
+        return self.kind, (radius, max(float(segment.size[2]), FLAT)), tuple(segment.pose.tolist())
 
 
 class ConeShape(CylinderShape):
@@ -608,7 +608,7 @@ class EllipsoidShape(ContactShape):
         return [dataclasses.replace(self, margin=self.margin + margin)]
 
     def primitive(self, least: float) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
-        return "box", tuple(np.maximum(self.half, FLAT).tolist()), tuple(np.asarray(self.pose).tolist())
+        return "ellipsoid", tuple(np.maximum(self.half, FLAT).tolist()), tuple(np.asarray(self.pose).tolist())
 
 
 SHAPES: Mapping[str, type[ContactShape]] = {

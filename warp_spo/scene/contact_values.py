@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .checks import read_only
-from .contact_checks import warn_of_soft_contacts
+from .contact_checks import warn_of_large_spheres, warn_of_soft_contacts
 from .contact_defaults import DAMPING_TIME, POINTS_AT_REST, NeutralPose, chosen_stiffness
 from .ground import AWAY, HEIGHTS, HeightField, Listed
 from .pairs import pair_values
@@ -58,6 +58,7 @@ def contact_values(scene: Any) -> dict[str, np.ndarray]:
         for name, value in zip(CONTACT_VALUES, numbers, strict=True):
             values[name][0, i] = value
     warn_of_soft_contacts("Scene", scene, stand)
+    warn_of_large_spheres("Scene", scene)
     return {name: read_only(value) for name, value in values.items()}
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from ..scene.scene import Scene
 from .renderer import Camera, Renderer
 from .shapes import Primitive, size_of
+from .surfaces import Triangles
 
 LONGEST_SILENCE, PERIOD = 5.0, 10.0  # a film says how far it is if it takes longer than this, and as often as this [s]
 STEADY = 0.25  # a camera that follows keeps its height where the robot's changes less, over the camera's distance
@@ -25,7 +26,7 @@ def camera_of(scene: Scene, q: np.ndarray) -> Camera:
 
 
 def pictures(
-    scene: Scene, shapes: Sequence[Primitive], q: np.ndarray, camera: Camera, follow: bool = True,
+    scene: Scene, shapes: Sequence[Primitive | Triangles], q: np.ndarray, camera: Camera, follow: bool = True,
     markers: Sequence[Sequence[Primitive]] = (), captions: Sequence[str] = (), device: Any = "cpu",
 ) -> list:  # fmt: skip
     """Return a picture (PIL image) of each state.

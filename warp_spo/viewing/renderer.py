@@ -11,8 +11,11 @@ import warp as wp
 
 from ..scene.ground import HeightField, Plane
 from .shapes import Primitive
+from .surfaces import Triangles
 
-SIZES = {"sphere": ("radius",), "capsule": ("radius", "half_height"), "box": ("hx", "hy", "hz")}
+ROUND = ("radius", "half_height")
+SIZES = {"sphere": ("radius",), "capsule": ROUND, "cylinder": ROUND, "cone": ROUND, "box": ("hx", "hy", "hz"),
+         "ellipsoid": ("rx", "ry", "rz")}  # fmt: skip
 """Kind of a primitive -> Newton's names of its sizes."""
 SUN = (-0.36, 0.26, -0.9)  # direction of the light
 SUNLIGHT, SKYLIGHT, GROUNDLIGHT = (0.9, 0.89, 0.87), (0.25, 0.26, 0.28), (0.1, 0.1, 0.1)  # linear RGB
@@ -59,7 +62,7 @@ class Renderer:
     """Bodies with shapes on the ground, and a camera.
 
     Args:
-        shapes: primitives fixed to bodies or to the world. bodies: how many there are.
+        shapes: primitives and triangles fixed to bodies or to the world. bodies: how many there are.
         ground: of a scene; anything but a plane or a height field is drawn as the plane z = 0.
         camera: from where; pictures have its size.
         markers: primitives of the world that some pictures show.
@@ -68,7 +71,7 @@ class Renderer:
     """
 
     def __init__(
-        self, shapes: Sequence[Primitive], bodies: int, ground: Any, camera: Camera,
+        self, shapes: Sequence[Primitive | Triangles], bodies: int, ground: Any, camera: Camera,
         markers: Sequence[Primitive] = (), device: Any = "cpu", around: np.ndarray | None = None,
     ):  # fmt: skip
         import newton
@@ -80,6 +83,10 @@ class Renderer:
         first = [builder.add_body() for _ in range(bodies + len(markers))][bodies:]
         self.markers = dict(zip(markers, first, strict=True))
         for i, (shape, body) in enumerate([*((each, each.body) for each in shapes), *self.markers.items()]):
+            if isinstance(shape, Triangles):
+                mesh = newton.Mesh(shape.vertices, shape.faces.ravel(), compute_inertia=False)
+                builder.add_shape_mesh(body, mesh=mesh, color=shape.color)
+                continue
             # Each a little thicker than the one before: rays would hit either of two surfaces that coincide.
             size = (shape.size[0] * (1.0 + GROWTH * i), *shape.size[1:])
             add = getattr(builder, f"add_shape_{shape.kind}")

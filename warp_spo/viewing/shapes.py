@@ -17,8 +17,8 @@ class Primitive(NamedTuple):
     """A shape that is drawn, fixed to a body.
 
     Attributes:
-        kind: "sphere", "capsule" or "box". body: index of the body; -1: the world.
-        size: radius [m]; radius and half length along z; half the sizes.
+        kind: "sphere", "capsule", "cylinder", "cone", "box" or "ellipsoid". body: index of the body; -1: the world.
+        size: radius [m]; of the next three radius and half length along z; half the sizes.
         pose: position [m] and quaternion (xyzw) in the body frame [7]. color: red, green, blue, 0 to 1.
     """
 
@@ -32,7 +32,7 @@ class Primitive(NamedTuple):
 def primitives(scene: Scene, q: np.ndarray) -> tuple[Primitive, ...]:
     """Return shapes to draw, from the contacts with the ground and the joints of a scene.
 
-    A contact is drawn as the sphere, the capsule or the box that its shape says. A bone is a capsule from the
+    A contact is drawn as the shape that it is, a hull as the box about it. A bone is a capsule from the
     joint of a body to those of its children, or to the centre of mass where it has neither children nor contacts.
 
     Args:

@@ -52,11 +52,11 @@ class Storage:
         self.controls: dict[str, torch.Tensor] = {}
         self.written: dict[str, torch.Tensor] = {}
         self.values: dict[str, torch.Tensor] = {}
-        self._firsts: dict[str, torch.Tensor] = {}  # of a world, before the first step; others are zeros
+        self._initial: dict[str, torch.Tensor] = {}  # of a world, before the first step; others are zeros
         self._add_state(layout)
         self._add_controls(layout, read)
         self._add_measured(layout, read)
-        self._add_numbers(layout, tables)
+        self._add_tables_and_values(layout, tables)
         self._add_results(results, apart)
         self.clear()
 
@@ -64,7 +64,7 @@ class Storage:
         """Set all that steps change to what it is before the first: default coordinates, the scene's values, zeros."""
         for tensor in (*self.changing().values(), *self.written.values()):
             tensor.zero_()
-        for name, first in self._firsts.items():
+        for name, first in self._initial.items():
             self.tensors[name].copy_(first)
 
     def part(self, out: torch.Tensor, name: str) -> torch.Tensor:
@@ -107,7 +107,7 @@ class Storage:
 
     def _add_state(self, layout: MemoryLayout) -> None:
         worlds, scene = self.worlds, layout.scene
-        self._firsts["q"] = torch.tensor(layout.default_q, dtype=torch.float32, device=self.device)
+        self._initial["q"] = torch.tensor(layout.default_q, dtype=torch.float32, device=self.device)
         self._add("q", self._zeros(worlds, scene.coord_count))
         self._add("qd", self._zeros(worlds, scene.dof_count))
         self._add("actions", self._zeros(worlds, layout.action_count))
@@ -126,7 +126,7 @@ class Storage:
         for name in sorted(layout.action_arrays):
             self.controls[name] = self._add(name, self._zeros(self.worlds, layout.control_sizes[name]))
         for name in {"target_q", NET_TARGETS} & self.controls.keys():
-            self._firsts[name] = self._firsts["q"]
+            self._initial[name] = self._initial["q"]
         for number, (joints, slots) in enumerate(layout.networks):
             if slots:
                 self._add(ring_name(number), self._zeros(2 * slots, self.worlds, joints), COLUMN)
@@ -151,20 +151,23 @@ class Storage:
         if "frame_acceleration" in read:
             self._add("frame_acceleration", self._zeros(worlds, frames, 6))
 
-    def _add_numbers(self, layout: MemoryLayout, tables: Mapping[str, torch.Tensor]) -> None:
-        """Add tables that all worlds share, values that events change, and what users compute in torch."""
+    def _add_tables_and_values(self, layout: MemoryLayout, tables: Mapping[str, torch.Tensor]) -> None:
+        """Add tables that all worlds share, values of the scene by world, and what users compute in torch.
+
+        Values are those that events change, then those that differ between worlds of the scene itself; none is both.
+        """
         for name, table in tables.items():
             self._add(name, table.reshape(-1), SHARED)
         for name, numbers in layout.tables.items():
             flat = torch.tensor(np.asarray(numbers), dtype=torch.float32, device=self.device).reshape(-1)
             self._add(name, flat, SHARED)
         for name in layout.values:
-            own = torch.tensor(layout.scene.values[name][0], dtype=torch.float32, device=self.device)
-            self._firsts[f"value_{name}"] = own
-            self.values[name] = self._add(f"value_{name}", self._zeros(self.worlds, *own.shape))
+            initial = torch.tensor(layout.scene.values[name][0], dtype=torch.float32, device=self.device)
+            self._initial[f"value_{name}"] = initial
+            self.values[name] = self._add(f"value_{name}", self._zeros(self.worlds, *initial.shape))
         for name in sorted(layout.unequal):
-            every = torch.tensor(layout.scene.values[name], dtype=torch.float32, device=self.device)
-            self._firsts[f"value_{name}"] = self._add(f"value_{name}", every).clone()
+            by_world = torch.tensor(layout.scene.values[name], dtype=torch.float32, device=self.device)
+            self._initial[f"value_{name}"] = self._add(f"value_{name}", by_world).clone()
         if layout.users:
             self._add("user", self._zeros(self.worlds, layout.user_size))
 

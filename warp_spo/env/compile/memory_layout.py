@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any
 
@@ -37,6 +38,17 @@ def check_memory_name(call: str, name: Any) -> None:
             f"{call}: {shown(name)!r} is a name under which the environment itself remembers something; expected "
             "another one"
         )
+
+
+def as_steps(seconds: float, step: float) -> float:
+    """Return a time [s] in steps of so many seconds, a whole number where it is one but for rounding."""
+    steps = seconds / step
+    return round(steps) if abs(steps - round(steps)) <= ROUNDING * max(1.0, steps) else steps
+
+
+def count_steps(seconds: float, step: float) -> int:
+    """Return how many whole steps a time [s] takes, rounded up, one or more."""
+    return max(1, math.ceil(as_steps(seconds, step)))
 
 
 class MemoryLayout:
@@ -131,10 +143,9 @@ class MemoryLayout:
 
     def whole_steps(self, seconds: float) -> float:
         """Return a time in steps of the environment, a whole number where it is one but for rounding."""
-        steps = seconds / self.step_dt
-        return round(steps) if abs(steps - round(steps)) <= ROUNDING * max(1.0, steps) else steps
+        return as_steps(seconds, self.step_dt)
 
-    def grown(self, name: str) -> Any:
+    def update_level(self, name: str) -> Any:
         """Return what a world remembers of a level after the step that "judge" looks at, which keeps it."""
         w, ended = self.judged  # type: ignore[misc]
         if name not in w.kept:

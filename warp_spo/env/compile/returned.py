@@ -59,7 +59,7 @@ def condition(what: str, value: Any) -> Condition:
     raise TypeError(f"Env: {what} {came(value)}; expected a comparison, such as w.q[1] > 0.3")
 
 
-def checked_event(event: Any, number: int) -> Any:
+def check_event(event: Any, number: int) -> Any:
     """Return an event, ``events[number]``, whose change checks what it assigns: as many numbers as there are.
 
     Its errors are those of :func:`numbers`, and one for a value that is not among the event's names.

@@ -26,7 +26,7 @@ from .buffers import FAULT
 from .fused_kernel import FusedKernel
 from .guard import BEYOND, LARGEST, NOT_FINITE, Check, first, within
 from .memory_layout import MemoryLayout
-from .returned import check_force, checked_event, commands_drawn, condition, controls, one_number
+from .returned import check_event, check_force, commands_drawn, condition, controls, one_number
 from .vectors import Vector, as_value, vector
 
 CHOSEN_WORLD = "chosen.data[world]"  # C++: the world has just started anew
@@ -64,7 +64,7 @@ class Tracing:
                         "Env: events has two encoder_bias; expected one, whose names= are several expressions"
                     )
                 layout.biased = World(layout, FusedKernel("none", 0)).joints(event.names)
-        self.events = [checked_event(event, i) for i, event in enumerate(events)]
+        self.events = [check_event(event, i) for i, event in enumerate(events)]
         self.ends = [*terminations, NOT_FINITE, BEYOND]
         names = ("act", "judge", "observe", "reset", "start", "final")
         self.stages = {name: FusedKernel(name, stream) for stream, name in enumerate(names)}
@@ -116,7 +116,7 @@ class Tracing:
                 self.guard.hold(self.judge, [name], self.bad)
         self._first()
         for name in self.layout.levels:
-            self.layout.grown(name)
+            self.layout.update_level(name)
         self._close()
         self._reset()
 

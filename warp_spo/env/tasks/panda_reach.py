@@ -83,4 +83,4 @@ def build(worlds: int, device: Any = None, seed: int = 0, space: str = "joint", 
 
 def measure(env: Env, policy: Any) -> dict[str, float]:
     """Return how close the hand has come to each place."""
-    return evaluation.reach(env, policy, "hand", PERIOD)
+    return evaluation.reach(env, policy, "hand")

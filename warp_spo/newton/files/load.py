@@ -9,6 +9,7 @@ from xml.etree.ElementTree import ParseError
 
 import newton
 
+from ...errors import is_bool, quoted
 from ...scene.collision_shapes import POINTS, ShapeSelection
 from ...scene.ground import HeightField, Plane
 from ...scene.scene import Scene
@@ -17,6 +18,8 @@ from .usd import read_usd
 
 FORMATS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf"} | dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "usd")
 """Format by suffix in lower case."""
+WORDS = {"urdf": "a URDF file", "mjcf": "an MJCF file", "usd": "a USD file"}
+LONGEST_PATH = 300  # characters of a path in a message
 
 
 SHIPPED = {
@@ -92,8 +95,10 @@ def load(
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: No importer reads files with this suffix, or the file's contents. Of a URDF, the message names the
-            line and the element. Or a pattern of ``contacts`` matches no shape; the message lists the bodies with some.
+        TypeError: ``path`` is no path, or another argument is of another type.
+        ValueError: The path is that of a folder. Or no importer reads files with this suffix, or the file's contents.
+            Of a URDF, the message names the line and the element. Or a pattern of ``contacts`` matches no shape; the
+            message lists the bodies with some.
         ImportError: A package for meshes or USD is missing. The message names the extra that installs it.
         UnsupportedError, DirectedLoopError: As :func:`from_newton` and :func:`from_mujoco`.
         UnsupportedError: A pattern of ``contacts`` names a shape that no contact represents, or the file has several
@@ -105,7 +110,10 @@ def load(
             a URDF, such as effort="0", stop joints or what drives them. An MJCF file holds contacts, sensors or other
             things that a scene leaves out, and a USD file attributes of physics.
     """
-    file = Path(path)
+    for name, value, wanted in (("floating", floating, "None, True or False"), ("repair", repair, "True or False")):
+        if not is_bool(value) and (name == "repair" or value is not None):
+            raise TypeError(f"load: {name} is {quoted(value)}; expected {wanted}")
+    file = robot_path(path)
     importer = robot_format(file)
     read: Callable[[Path, bool | None, bool, ShapeSelection], Scene]
     if importer == "mjcf":
@@ -117,7 +125,7 @@ def load(
     try:
         return read(file, floating, repair, ShapeSelection(contacts, ground, points, pairs))
     except ParseError as error:
-        raise ValueError(f"load: {str(file)!r} is not XML: {error}; expected {importer.upper()}") from None
+        raise not_xml(file, error, importer) from None
     except ImportError as error:
         extra = "usd" if importer == "usd" else "meshes"
         need = "USD files" if importer == "usd" else "meshes"
@@ -125,6 +133,37 @@ def load(
             f"load: {str(file)!r} needs a package that is missing ({error}) to read {need}; "
             f"pip install warp_spo[{extra}]"
         ) from error
+
+
+def robot_path(path: str | os.PathLike[str]) -> Path:
+    """Return the path that a caller gives.
+
+    Raises:
+        TypeError: It is no path.
+        ValueError: It is empty, the text of a robot file, or the path of a folder.
+    """
+    text = os.fspath(path) if isinstance(path, str | os.PathLike) else None
+    if not isinstance(text, str):
+        raise TypeError(
+            f"load: path is {quoted(path)}; expected the path of a robot file, a str or a pathlib.Path; "
+            "from_newton and from_mujoco read models that are in memory"
+        )
+    if not text:
+        raise ValueError("load: path is ''; expected the path of a robot file, such as 'robot.urdf'")
+    if text.lstrip().startswith(("<", "#usda")):
+        raise ValueError(
+            f"load: path is {quoted(text)}, which is a robot description, not a path; write it into a file, and pass "
+            "its path"
+        )
+    if os.path.isdir(text):
+        found = sorted(file for file in Path(text).iterdir() if file.suffix.lower() in FORMATS)
+        files = [file.name for file in found if file.is_file()]
+        inside = f"it holds {', '.join(map(quoted, files[:6]))}" if files else "it holds none"
+        more = f" and {len(files) - 6} more" if files[6:] else ""
+        raise ValueError(
+            f"load: {quoted(text, LONGEST_PATH)} is a folder; expected the path of a robot file in it; {inside}{more}"
+        )
+    return Path(text)
 
 
 def robot_format(file: Path) -> str:
@@ -136,10 +175,24 @@ def robot_format(file: Path) -> str:
     """
     name = FORMATS.get(file.suffix.lower())
     if name is None:
-        raise ValueError(f"load: {str(file)!r} ends in {file.suffix!r}; expected one of {', '.join(FORMATS)}")
-    if not file.is_file():
+        end = f"ends in {quoted(file.suffix)}" if file.suffix else "has no suffix"
+        raise ValueError(
+            f"load: {quoted(str(file), LONGEST_PATH)} {end}; expected one of {', '.join(FORMATS)}, which "
+            "says the format; rename the file"
+        )
+    if not os.path.isfile(file):  # of a path that is too long, too
+        home = ", where ~ is not replaced: pass Path(...).expanduser()" if str(file).startswith("~") else ""
         raise FileNotFoundError(
-            f"load: no file {str(file)!r} (from {os.getcwd()!r}); expected the path of a "
-            f"{name.upper()} file; call shipped(name) for a robot that comes with Newton"
+            f"load: no file {quoted(str(file), LONGEST_PATH)} (from {os.getcwd()!r}{home}); expected the path of "
+            f"{WORDS[name]}; call shipped(name) for a robot that comes with Newton"
         )
     return name
+
+
+def not_xml(file: Path, error: Exception, name: str) -> ValueError:
+    """Return the error for a file that should be XML of a format, and is not."""
+    root = {"urdf": "<robot>", "mjcf": "<mujoco>"}[name]
+    what = f"is not XML: {error}" if os.path.getsize(file) else "is empty"
+    return ValueError(
+        f"load: {str(file)!r} {what}; expected {WORDS[name]}, whose first element is {root}; correct the file"
+    )

@@ -60,7 +60,8 @@ def read_urdf(file: Path, floating: bool | None, repair: bool, selection: ShapeS
     """Return the scene of a URDF file. See :func:`warp_spo.newton.load`.
 
     Raises:
-        ValueError: The file is not XML or not a URDF; the message names line and element.
+        xml.etree.ElementTree.ParseError: The file is not XML.
+        ValueError: The file is not a URDF; the message names line and element.
         UnsupportedError: The file needs xacro first.
     """
     robot = read_xml(file)

@@ -10,7 +10,7 @@ from typing import Any
 import newton
 import numpy as np
 
-from ...errors import quoted
+from ...errors import quoted, shown
 from .xml_source import XmlElement
 
 
@@ -37,7 +37,7 @@ def mass_of_shapes(link: XmlElement) -> tuple[float, np.ndarray, np.ndarray]:
     try:
         builder.add_urdf(ET.tostring(robot, encoding="unicode"))
     except (ValueError, TypeError, IndexError) as error:
-        raise link.error(f"its collision shapes cannot be read ({error}); write <inertial>") from error
+        raise link.error(f"its collision shapes cannot be read ({shown(str(error))}); write <inertial>") from error
     inertia = np.array(builder.body_inertia[0], dtype=np.float64).reshape(3, 3)
     return float(builder.body_mass[0]), np.array(builder.body_com[0], dtype=np.float64), 0.5 * (inertia + inertia.T)
 

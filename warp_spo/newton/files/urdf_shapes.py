@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import quoted
+from ...errors import quoted, shown
 from ...scene.collision_shapes import CollisionShape
 from ...scene.contact_shapes import SHAPES, kinds_in
 from ...scene.scene import Scene
@@ -110,7 +110,9 @@ def _vertices(shape: Any, file: Any) -> np.ndarray:
         scene = trimesh.load_scene(file)
         parts = [part.vertices for part in scene.dump() if hasattr(part, "vertices")]
     except Exception as error:  # its readers raise errors of any type for a damaged file
-        raise shape.error(f"its file cannot be read ({type(error).__name__}: {error}); correct it") from error
+        raise shape.error(
+            f"its file cannot be read ({type(error).__name__}: {shown(str(error))}); correct it"
+        ) from error
     if not parts or not sum(map(len, parts)):
         raise shape.error("its file has no vertices; expected a mesh; correct it")
     return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])

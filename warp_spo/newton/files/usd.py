@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,8 @@ from .usd_values import (
 
 UNITS = (1e-9, 1e9)
 """Least and largest unit of length [m] and of mass [kg] of a file."""
+OF_OPENUSD = re.compile(r"Error in '[^']*' at line \d+ in file \S+ : '(.*?)'(?= Error in '|$)")
+"""The words of each error in a message of OpenUSD, behind its place in the source."""
 MOST = 600
 """Characters of the words of an importer's error."""
 DIMENSIONS = {
@@ -78,12 +81,9 @@ def _read(
     file: Path, call: str, floating: bool | None, repair: bool, selection: ShapeSelection
 ) -> tuple[Scene, list[str]]:
     """Return the scene of a file, and in words what it leaves out; arguments and errors as :func:`read_usd`."""
-    from pxr import Usd, UsdGeom, UsdPhysics  # an ImportError names the extra
+    from pxr import UsdGeom, UsdPhysics  # an ImportError names the extra
 
-    check_nesting(file)
-    check_size(file)
-    stage = Usd.Stage.Open(str(file))
-    stage.Reload()  # layers stay in memory as long as a stage has them
+    stage = _opened(file)
     metre, kilogram = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
     for name, unit in (("metersPerUnit", metre), ("kilogramsPerUnit", kilogram)):
         if not UNITS[0] <= unit <= UNITS[1]:
@@ -107,6 +107,28 @@ def _read(
     of_loops = {path for path, joint in found["path_joint_map"].items() if labels[joint] in loops}
     contacts = selection.contacts is not None
     return scene, left_out(stage, of_loops, set(found["path_joint_map"]), found["physics_scene_path"], contacts)
+
+
+def _opened(file: Path) -> Any:
+    """Return the stage of a file.
+
+    Raises:
+        ValueError: OpenUSD cannot open it, or it is nested too deep or too large.
+    """
+    from pxr import Tf, Usd
+
+    if not file.stat().st_size:
+        raise ValueError(f"load: {str(file)!r} is empty; expected a USD file; correct the file")
+    try:
+        check_nesting(file)
+        check_size(file)
+        stage = Usd.Stage.Open(str(file))
+        stage.Reload()  # layers stay in memory as long as a stage has them
+    except Tf.ErrorException as error:
+        raise ValueError(
+            f"load: {str(file)!r}: OpenUSD cannot open it ({words_of(error)}); expected a USD file; correct the file"
+        ) from error
+    return stage
 
 
 def _imported(stage: Any, floating: bool | None, density: float) -> tuple[newton.ModelBuilder, dict[str, Any]]:
@@ -254,10 +276,17 @@ def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool, selection: 
 
 def unreadable(file: Path, error: Exception) -> ValueError:
     """Return the error for a file on which an importer failed; its own words become one line."""
-    try:
-        words = shown(" ".join(str(error).split()), MOST)
-    except UnicodeDecodeError:  # the words of OpenUSD may hold the file's bytes
-        words = "bytes that are no text"
     return ValueError(
-        f"load: {str(file)!r}: Newton's importer cannot read it ({type(error).__name__}: {words}); correct the file"
+        f"load: {str(file)!r}: Newton's importer cannot read it ({type(error).__name__}: {words_of(error)}); correct "
+        "the file"
     )
+
+
+def words_of(error: Exception) -> str:
+    """Return an error's message in one line that prints, without the places in the source of OpenUSD that it names."""
+    try:
+        words = " ".join(str(error).split())
+    except UnicodeDecodeError:  # the words of OpenUSD may hold the file's bytes
+        return "bytes that are no text"
+    said = OF_OPENUSD.findall(words)
+    return shown("; ".join(said) or words, MOST)

@@ -76,7 +76,7 @@ def read_xml(file: Path) -> XmlElement:
     """Return the root element of an XML file. Namespaces are not resolved: prefixes stay in the tags.
 
     Raises:
-        ValueError: The file is not XML; the message names the line.
+        ET.ParseError: The file is not XML; the message names the line.
     """
     parser = expat.ParserCreate()
 
@@ -92,6 +92,6 @@ def read_xml(file: Path) -> XmlElement:
     try:
         parser.Parse(file.read_bytes(), True)
     except (expat.ExpatError, ValueError, LookupError) as error:  # the last two: of an encoding
-        raise ValueError(f"load: {str(file)!r} is not XML: {error}; expected a robot description") from None
+        raise ET.ParseError(str(error)) from None
     root: Any = builder.close()
     return root

@@ -25,8 +25,8 @@ class Shape(NamedTuple):
     """A shape over a field.
 
     Attributes:
-        kind: one of GRIDS. centre: its middle, from the field's first point. axes: one each, inertial axes.
-        sizes, table: those of its supports. radius: by which it is larger [m].
+        kind: one of GRIDS, or HULL_CORNER. centre: its middle, from the field's first point.
+        axes: one each, inertial axes. sizes, table: those of its supports. radius: by which it is larger [m].
     """
 
     kind: str
@@ -46,13 +46,20 @@ class GridPlace(NamedTuple):
 
 def find(graph: Graph, ground: HeightField, place: GroundOffset, shape: Shape) -> list[Scalar]:
     """Return what a search finds, row after row."""
+    return search_field(graph, ground, place, shape, GRIDS[shape.kind][0], QUADRANTS * ROW)
+
+
+def search_field(
+    graph: Graph, ground: HeightField, place: GroundOffset, shape: Shape, name: str, count: int
+) -> list[Scalar]:
+    """Return the ``count`` numbers that the search of this name finds for a shape over a field."""
     rows, columns = ground.heights.shape[-2:]
     first: Value = 0.0
     if ground.count > 1:
         first = floor(clamp(place.field, ground.count - 1.0)) * float(rows * columns)
     asked = [first, *shape.centre, *(x for axis in shape.axes for x in axis), *shape.sizes]
     asked += [*ground.cells, float(rows), float(columns), *shape.table]
-    return search(graph, GROUND, GRIDS[shape.kind][0], asked, QUADRANTS * ROW)
+    return search(graph, GROUND, name, asked, count)
 
 
 def touch(

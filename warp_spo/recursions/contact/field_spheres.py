@@ -1,11 +1,12 @@
 """Spheres on a height field: the nearest points of the surface to the centre, and the normals there.
 
 A sphere touches where the surface is nearest to its centre c, in the direction from there to c. The cells around the
-grid point nearest to c are tried, two along each axis, or four where the radius is large beside the cell. In each the
-nearest point of its bilinear surface is found by Gauss and Newton from the place next to c: with slopes g and the
-height's error w there, the move u of least |e - u|^2 + (w - g . u)^2, where e leads to c, kept inside of the cell. The
-nearest cell's point is found again, with a step more, so that its derivatives are those of that cell's heights alone.
-Which cell that is a search in native code says, as :mod:`warp_spo.reference.field_spheres` specifies.
+grid point nearest to c are tried, two along each axis, or four where the radius is large beside the cell; beyond an
+edge they are level across it. In each the nearest point of its bilinear surface is found by Gauss and Newton from the
+place next to c: with slopes g and the height's error w there, the move u of least |e - u|^2 + (w - g . u)^2, where e
+leads to c, kept inside of the cell. The nearest cell's point is found again, with a step more, so that its derivatives
+are those of that cell's heights alone. Which cell that is a search in native code says, see
+:mod:`warp_spo.reference.field_grid`.
 
 Where a field has walls or creases a sphere may touch a second point: the nearest one that lies in another direction.
 """
@@ -17,7 +18,7 @@ from typing import NamedTuple
 from ...scene.ground import AWAY, HeightField
 from ...trace.scalars import Graph, Value, floor, inverse_root, less, reciprocal, search, select
 from ...trace.spatial import Vector, dot
-from .ground import GROUND, Corners, GroundOffset, Surface, clamp
+from .ground import GROUND, Corners, Edges, GroundOffset, Surface, clamp
 
 SPHERE, FOUND = "sphere", 5  # the search and how many numbers it finds: i, j of two cells, whether the second counts
 STEPS = 2  # of Gauss and Newton in each cell; the nearest one takes one more
@@ -74,11 +75,14 @@ def sphere_surfaces(
         first = floor(clamp(place.field, ground.count - 1.0)) * float(rows * columns)
     asked = [first, x, y, z, size_x, size_y, float(rows), float(columns), float(cells), float(second)]
     *found, there = search(graph, GROUND, SPHERE, asked, FOUND)
-    at_x, at_y = clamp(x * (1.0 / size_x), rows - 1.0), clamp(y * (1.0 / size_y), columns - 1.0)
+    at_x = clamp(x * (1.0 / size_x), rows - 1.0 + cells, -float(cells))
+    at_y = clamp(y * (1.0 / size_y), columns - 1.0 + cells, -float(cells))
 
     def surface(i: Value, j: Value, near: Value | None) -> Surface:
-        cell = Cell(Corners.of(graph, ground, place, i, j), (at_x - i) * size_x, (at_y - j) * size_y)
-        return _surface(cell, _foot(cell, z, size_x, size_y, STEPS + 1), radius, near)
+        read = Corners.of(graph, ground, place, clamp(i, rows - 2.0), clamp(j, columns - 2.0))
+        corners = read.levelled(Edges.of(i, j, rows - 1, columns - 1))
+        cell = Cell(corners, (at_x - i) * size_x, (at_y - j) * size_y)
+        return _surface(read, _foot(cell, z, size_x, size_y, STEPS + 1), radius, near)
 
     if not second:
         return [surface(found[0], found[1], None)]
@@ -111,7 +115,7 @@ def _foot(cell: Cell, z: Value, size_x: float, size_y: float, steps: int) -> Foo
     return Foot(away, dot(away, away), less(0.0, away[2] - a * away[0] - b * away[1]))
 
 
-def _surface(cell: Cell, foot: Foot, radius: Value, near: Value | None) -> Surface:
+def _surface(read: Corners, foot: Foot, radius: Value, near: Value | None) -> Surface:
     """Return the surface at the nearest point; a centre inside of the ground leaves it the shortest way."""
     known = less(TINY, foot.square)
     inverse = inverse_root(select(known, foot.square, 1.0))
@@ -121,5 +125,5 @@ def _surface(cell: Cell, foot: Foot, radius: Value, near: Value | None) -> Surfa
     normal = Vector((select(known, x, 0.0), select(known, y, 0.0), select(known, z, 1.0)))
     depth = radius - sign * (select(known, foot.square, 0.0) * inverse)
     if near is None or near == 1.0:
-        return Surface(normal, depth, cell.corners, near)
-    return Surface(normal, select(near, depth, AWAY), cell.corners, near)
+        return Surface(normal, depth, read, near)
+    return Surface(normal, select(near, depth, AWAY), read, near)

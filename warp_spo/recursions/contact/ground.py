@@ -3,7 +3,8 @@
 A plane has one normal. A height field is bilinear in each cell: the depth is (H - z) n_z with the normal n of the field
 under the point, held over the step. Where a cell is steeper than STEEP, the point has two surfaces instead: the wall,
 which is the cell's plane and ends at its highest corner, and the floor, which is flat at the height of its lowest one.
-A point that the step takes into such a cell has its wall already. Spheres on a field are in :mod:`.field_spheres`.
+A point that the step takes into such a cell has its wall already. Beyond an edge the field goes on as it is at the
+edge, level across it. Spheres on a field are in :mod:`.field_spheres`.
 """
 
 from __future__ import annotations
@@ -81,41 +82,58 @@ def surfaces(
     x, y, z = at
     rows, columns = ground.heights.shape[-2:]
     rate_x, rate_y = (1.0 / cell for cell in ground.cells)
-    i, s = _cell((x - ground.origin[0]) * rate_x, rows)
-    j, t = _cell((y - ground.origin[1]) * rate_y, columns)
-    cell = Corners.of(graph, ground, place, i, j)
-    z = z - ground.origin[2]
+    x, y, z = ((a - b) * rate for a, b, rate in zip((x, y, z), ground.origin, (rate_x, rate_y, 1.0), strict=True))
+    (i, s), (j, t) = _cell(x, rows), _cell(y, columns)
+    read = Corners.of(graph, ground, place, i, j)
+    edges = Edges.of(x, y, rows, columns)
+    cell = read.levelled(edges)
     height = cell.base + cell.run * s + cell.rise * t + cell.twist * (s * t)
     smooth = facing((cell.run + cell.twist * t) * rate_x, (cell.rise + cell.twist * s) * rate_y)
     steep_somewhere = has_walls(ground, place.varies)
     if not (walls and steep_somewhere):
-        return [Surface(smooth, (height - z) * smooth[2], cell, 1.0 if steep_somewhere else None)]
+        return [Surface(smooth, (height - z) * smooth[2], read, 1.0 if steep_somewhere else None)]
     steep = less(STEEP * STEEP, cell.steepness(rate_x, rate_y))
     flat = Vector(select(steep, a, b) for a, b in zip(IDENTITY[2], smooth, strict=True))
-    bottom = Surface(flat, (select(steep, cell.lowest, height) - z) * flat[2], cell, 1.0)
-    next_i = _cell((x + moves[0] - ground.origin[0]) * rate_x, rows)[0]
-    next_j = _cell((y + moves[1] - ground.origin[1]) * rate_y, columns)[0]
+    bottom = Surface(flat, (select(steep, cell.lowest, height) - z) * flat[2], read, 1.0)
+    next_x, next_y = x + moves[0] * rate_x, y + moves[1] * rate_y
+    next_i, next_j = _cell(next_x, rows)[0], _cell(next_y, columns)[0]
     ahead = Corners.of(graph, ground, place, next_i, next_j)  # read side by side with the cell under the point
-    cell = Corners(*(select(steep, a, b) for a, b in zip(cell, ahead, strict=True)))
+    read = Corners(*(select(steep, a, b) for a, b in zip(read, ahead, strict=True)))
+    then = Edges.of(next_x, next_y, rows, columns)
+    cell = read.levelled(Edges(*(select(steep, a, b) for a, b in zip(edges, then, strict=True))))
     s, t = (i + s) - select(steep, i, next_i), (j + t) - select(steep, j, next_j)
     run, rise = cell.run + 0.5 * cell.twist, cell.rise + 0.5 * cell.twist
     wall = facing(run * rate_x, rise * rate_y)
     middle = cell.mean + run * (s - 0.5) + rise * (t - 0.5)
     rises = select(steep, 1.0, less(0.0, run * rate_x * moves[0] + rise * rate_y * moves[1]))
     there = rises * less(STEEP * STEEP, cell.steepness(rate_x, rate_y)) * (1.0 - less(cell.highest, z))
-    return [bottom, Surface(wall, select(there, (middle - z) * wall[2], AWAY), cell, there)]
+    return [bottom, Surface(wall, select(there, (middle - z) * wall[2], AWAY), read, there)]
 
 
 def upward(graph: Graph, ground: HeightField, at: list[Value], place: GroundOffset) -> Vector:
     """Return the normal of a field over or under a place, the vertical where its cell is steep."""
     rows, columns = ground.heights.shape[-2:]
     rate_x, rate_y = (1.0 / cell for cell in ground.cells)
-    i, s = _cell((at[0] - place.origin[0] - ground.origin[0]) * rate_x, rows)
-    j, t = _cell((at[1] - place.origin[1] - ground.origin[1]) * rate_y, columns)
-    cell = Corners.of(graph, ground, place, i, j)
+    x, y = (at[0] - place.origin[0] - ground.origin[0]) * rate_x, (at[1] - place.origin[1] - ground.origin[1]) * rate_y
+    (i, s), (j, t) = _cell(x, rows), _cell(y, columns)
+    cell = Corners.of(graph, ground, place, i, j).levelled(Edges.of(x, y, rows, columns))
     smooth = facing((cell.run + cell.twist * t) * rate_x, (cell.rise + cell.twist * s) * rate_y)
     steep = less(STEEP * STEEP, cell.steepness(rate_x, rate_y))
     return Vector(select(steep, a, b) for a, b in zip(IDENTITY[2], smooth, strict=True))
+
+
+class Edges(NamedTuple):
+    """Beyond which edges of a field a place is, each 1 or 0: before the first point along x, after the last, then y."""
+
+    before_x: Value
+    after_x: Value
+    before_y: Value
+    after_y: Value
+
+    @classmethod
+    def of(cls, x: Value, y: Value, rows: int, columns: int) -> Edges:
+        """Return those of a place in cells."""
+        return cls(less(x, 0.0), less(rows - 1.0, x), less(y, 0.0), less(columns - 1.0, y))
 
 
 class Corners(NamedTuple):
@@ -129,7 +147,7 @@ class Corners(NamedTuple):
 
     @classmethod
     def of(
-        cls, graph: Graph, ground: HeightField, place: GroundOffset, i: Value, j: Value, together: bool = True
+        cls, graph: Graph, ground: HeightField, place: GroundOffset, i: Value, j: Value, by_cell_table: bool = True
     ) -> Corners:
         """Return the corners of the cell (i, j) of a world's field, from the table of cells or, one by one, of heights.
 
@@ -139,11 +157,22 @@ class Corners(NamedTuple):
         first = i * float(columns) + j
         if ground.count > 1:
             first = floor(clamp(place.field, ground.count - 1.0)) * float(rows * columns) + first
-        if together:
+        if by_cell_table:
             h00, h01, h10, h11 = lookup(graph, GROUND, first, CORNERS)
         else:
             h00, h01, h10, h11 = (entry(graph, SINGLE, first, step) for step in corner_steps(ground))
         return cls(h00, h01, h10, h11, first)
+
+    def levelled(self, edges: Edges) -> Corners:
+        """Return the corners of the cell beyond the edges that is level across them, next to this one."""
+        h00, h01, h10, h11 = self.heights
+        before, after = edges.before_x, edges.after_x
+        h00, h10 = select(after, h10, h00), select(before, h00, h10)
+        h01, h11 = select(after, h11, h01), select(before, h01, h11)
+        before, after = edges.before_y, edges.after_y
+        h00, h01 = select(after, h01, h00), select(before, h00, h01)
+        h10, h11 = select(after, h11, h10), select(before, h10, h11)
+        return Corners(h00, h01, h10, h11, self.first)
 
     @property
     def heights(self) -> tuple[Value, Value, Value, Value]:
@@ -207,11 +236,11 @@ def by_cell(heights: np.ndarray) -> np.ndarray:
 
 
 def height(
-    graph: Graph, ground: Plane | HeightField, x: Value, y: Value, place: GroundOffset, together: bool = True
+    graph: Graph, ground: Plane | HeightField, x: Value, y: Value, place: GroundOffset, by_cell_table: bool = True
 ) -> Value:
     """Return the height of the ground at a point of the horizontal plane [m]; the plane must not be vertical.
 
-    ``together``: as :meth:`Corners.of`.
+    ``by_cell_table``: as :meth:`Corners.of`.
     """
     x, y = x - place.origin[0], y - place.origin[1]
     if isinstance(ground, Plane):
@@ -220,7 +249,7 @@ def height(
     rows, columns = ground.heights.shape[-2:]
     i, s = _cell((x - ground.origin[0]) * (1.0 / ground.cells[0]), rows)
     j, t = _cell((y - ground.origin[1]) * (1.0 / ground.cells[1]), columns)
-    cell = Corners.of(graph, ground, place, i, j, together)
+    cell = Corners.of(graph, ground, place, i, j, by_cell_table)
     return cell.base + cell.run * s + (cell.rise + cell.twist * s) * t + (ground.origin[2] + place.origin[2])
 
 
@@ -232,9 +261,9 @@ def _cell(x: Value, points: int) -> tuple[Value, Value]:
     return cell, x - cell
 
 
-def clamp(x: Value, most: float) -> Value:
-    """Return a number between zero and ``most``, so that no table is read beyond its end; NaN becomes zero."""
-    x = select(less(0.0, x), x, 0.0)
+def clamp(x: Value, most: float, least: float = 0.0) -> Value:
+    """Return a number between ``least`` and ``most``, so that no table is read beyond its end; NaN is the least."""
+    x = select(less(least, x), x, least)
     return select(less(x, most), x, most)
 
 

@@ -44,10 +44,10 @@ from ..model.tracing import Trace
 from ..motion import VelocityTerms, hinge_motion, link_motion
 from ..newton_euler import link_acceleration
 from ..step.joint_laws import is_number
-from .field_grid import ROW, GridPlace, Shape, find, touch
+from .field_grid import ROW, GridPlace, Shape, find, search_field, touch
 from .field_spheres import ring, sphere_surfaces
 from .ground import Corners, GroundOffset, Surface, directions, has_walls, lowest, surface_count, surfaces, upward
-from .supports import SupportPlacement, hull_corners, place_support
+from .supports import ROWS, SupportPlacement, hull_corners, place_corners, place_support
 from .turning import TurningFriction, turning_names, turning_scales
 from .velocity_kicks import KICK, PATH
 
@@ -216,7 +216,13 @@ def place_points(
             if point.support.kind == HULL_CORNER:
                 if point.contact not in corners:
                     axes, _, _ = _support_values(trace, number)
-                    corners[point.contact] = hull_corners(trace.graph, point.support, axes, down)
+                    if isinstance(ground, HeightField):
+                        at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
+                        shape = _shape_over(trace, number, ground, place_of_ground, at, toward, radius)
+                        asked_of = (trace.graph, ground, place_of_ground, shape)
+                        corners[point.contact] = place_corners(axes, search_field(*asked_of, "corners", 4 * ROWS))
+                    else:
+                        corners[point.contact] = hull_corners(trace.graph, point.support, axes, down)
                 placed = corners[point.contact][point.support.number]
             else:
                 placed = _place_support(trace, number, down)

@@ -7,7 +7,7 @@ point on a rim goes round with the axis, but not about it: what the link turns a
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from ...scene.supports import CORNER, RIM, SIDES, SURFACE, UPRIGHT, Support
@@ -45,10 +45,14 @@ def place_support(
 
 
 def hull_corners(graph: Graph, support: Support, axes: list[Vector], normal: Vector) -> list[SupportPlacement]:
-    """Return where all corners of a hull are that touch the ground, see :mod:`warp_spo.reference.hull_corners`."""
+    """Return where all corners of a hull are that touch a plane, see :mod:`warp_spo.reference.hull_corners`."""
     n = [dot(axis, normal) for axis in axes]
-    found = search(graph, "", "corners", [*n, *support.table], 4 * ROWS)
-    places = [_turned(axes, found[at : at + 3]) for at in range(0, len(found), 4)]
+    return place_corners(axes, search(graph, "", "corners", [*n, *support.table], 4 * ROWS))
+
+
+def place_corners(axes: list[Vector], found: Sequence[Value]) -> list[SupportPlacement]:
+    """Return where the corners of a hull are whose places and presence a search ``found``, four numbers each."""
+    places = [_turned(axes, list(found[at : at + 3])) for at in range(0, len(found), 4)]
     return [SupportPlacement(place, place, _still, there) for place, there in zip(places, found[3::4], strict=True)]
 
 

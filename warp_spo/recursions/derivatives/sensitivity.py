@@ -118,7 +118,10 @@ def drift(link: Link, place: LinkPlacement, parent: VelocityTerms | None, qd: ob
 
 
 def of_body(inertia: Rigid | None, motion: VelocityTerms) -> CarriedSums:
-    """A body that turns about its link's origin: u = omega x rho."""
+    """The sums of one body that no load acts on; it turns about its link's origin, u = omega x rho.
+
+    The origin's own velocity is left out: as the file says, it cancels in all forces.
+    """
     if inertia is None:
         return EMPTY
     J = inertia.inertia

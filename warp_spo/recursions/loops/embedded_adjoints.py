@@ -96,7 +96,7 @@ def forward_dynamics_vjp(trace: Trace, embedding: Embedding, wrt: tuple[str, ...
 
 
 def inverse_dynamics_vjp(trace: Trace, embedding: Embedding, wrt: tuple[str, ...]) -> list[Store]:
-    """J* cotangent of inverse dynamics in the independent dofs, for the arguments ``wrt``
+    """Return J* cotangent of inverse dynamics in the independent dofs, for the arguments ``wrt``.
 
     The function is X* (Mass qdd + bias_force) [independent dof], at the qdd = X qdd_independent + k that the closures
     allow. Its adjoint has the form of forward dynamics' one, with lambda = -X cotangent and multipliers from the

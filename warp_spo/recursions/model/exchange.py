@@ -92,6 +92,8 @@ class Exchange(abc.ABC):
     ) -> tuple[Articulated, Vector]:
         """Return P+ and z+ for a link's parent, with what contacts add to the parent if another evaluation works on it.
 
+        An evaluation of the whole tree adds the contacts of each link itself. That of a segment finds the contacts of
+        the parent that are given to it, each contact to one child alone, and sends them with its own P+ and z+.
         ``dampers``, ``pushes``: by id of the link, what contacts add to its articulated inertia and the forces on it.
         """
 
