@@ -10,6 +10,8 @@ import warp as wp
 
 import warp_spo as spo
 from support import pair_scenes
+from support.hull_scenes import RAMP
+from support.pair_motions import momentum
 from support.pair_scenes import H, box, cube, cubes_in_a_row, free, hand, hand_states, mixed, mixed_states, shelf
 from support.pair_steps import StepAtPoints, points_of
 from warp_spo.dynamics.stepping import joint_space as choice
@@ -280,6 +282,32 @@ def test_near_pairs_are_chosen_by_boxes(device):
     solver, cubes = dyn._joint_space, 7
     found = solver.near.numpy().reshape(2, -1)[:, 0]
     assert found.tolist() == [cubes - 1 + cubes, cubes - 1]
+
+
+@pytest.mark.parametrize("shape", [dict(box=(0.1, 0.1, 0.1)), dict(hull=RAMP / 8.0)], ids=["boxes", "hulls"])
+def test_bodies_that_are_thrown_at_each_other_gain_nothing(device, shape):
+    """Two that spin meet anyhow, without gravity: by edges, corners and faces; momenta stay.
+
+    With points from common parts of faces alone, some of these gain half of their energy.
+    """
+    rng, worlds, law = np.random.default_rng(1), 100, dict(stiffness=1e5, friction=0.5)
+    scene = free([cube(1.0, 0.1), cube(1.5, 0.1)], [spo.Contact(0, **shape, other=spo.Contact(1, **shape), **law)])
+    q, qd = np.zeros((worlds, 14)), 0.5 * rng.normal(size=(worlds, 12))
+    q[:, 3:7], q[:, 10:] = rng.normal(size=(worlds, 4)), rng.normal(size=(worlds, 4))
+    for turn in (q[:, 3:7], q[:, 10:]):
+        turn /= np.linalg.norm(turn, axis=1)[:, None]
+    way = rng.normal(size=(worlds, 3))
+    way /= np.linalg.norm(way, axis=1)[:, None]
+    q[:, 7:10], qd[:, 6:9] = 0.45 * way, -2.0 * way
+    dyn = spo.Dynamics(scene, worlds, device, "float64")
+    dyn._joint_space = choice.JointSpaceStep(dyn)
+    before, first, most, met = momentum(scene, q, qd), dyn.kinetic_energy(q, qd), 0.0, np.zeros(worlds, bool)
+    force = dyn.step_report("contact_f", like=q)
+    for _ in range(80):
+        q, qd = dyn.step(q, qd, None, H, report=force)
+        most, met = max(most, (dyn.kinetic_energy(q, qd) / first).max()), met | force.contact_f.any(axis=(1, 2))
+    assert met.sum() >= 80 and most < 1.0 + 1e-12
+    np.testing.assert_allclose(momentum(scene, q, qd), before, atol=1e-11)
 
 
 @pytest.mark.parametrize("speed", [2.0, 40.0, 400.0])

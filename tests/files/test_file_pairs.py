@@ -333,3 +333,36 @@ def test_what_pairs_do_not_take_is_said():
 def test_pairs_that_cannot_be_are_errors(pairs, error, words):
     with pytest.raises(error, match=words):
         quiet(spo.load, shipped("ant"), contacts="ground", pairs=pairs)
+
+
+OVERLAPPING = """<mujoco><asset><mesh name="tip" vertex="-1 -1 0 1 -1 0 1 1 0 -1 1 0 0 0 1" scale=".1 .1 .1"/></asset>
+ <worldbody><geom name="post" type="capsule" fromto="0 0 0 0 0 1" size=".05"/>
+ <body name="a" pos=".5 0 .4"><joint axis="0 1 0"/><geom name="a" type="box" size=".1 .1 .1"/>
+  <body name="b" pos=".3 0 0"><joint axis="0 1 0"/><geom name="b" type="sphere" size=".05"/>
+   <body name="c" pos="{gap} 0 0"><joint axis="0 1 0"/><geom name="c" {shape}/></body></body></body>
+ <body name="free"><freejoint/><geom size=".3"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("shape, gap, depth", [
+    ('type="box" size=".1 .1 .1"', -0.12, 0.02),  # two boxes 0.18 m apart, of 0.1 m half
+    ('type="box" size=".1 .1 .1" quat=".9238795 0 .3826834 0"', -0.07, None),
+    ('type="capsule" size=".05 .1" zaxis="0 1 0"', -0.16, 0.01),
+    ('type="mesh" mesh="tip"', -0.105, 5e-3),
+    ('type="box" size=".1 .1 .1"', -0.0995, None),
+])  # fmt: skip
+def test_pairs_that_overlap_at_first_are_said(shape, gap, depth, recwarn):
+    """With MuJoCo's depth; of what floats nothing is said, because a file does not place it in the neutral pose."""
+    model = mujoco.MjModel.from_xml_string(OVERLAPPING.format(shape=shape, gap=gap))
+    spo.from_mujoco(model, pairs="all")
+    found = [str(each.message) for each in recwarn.list if "overlap in the neutral pose" in str(each.message)]
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    names = {frozenset((model.geom("a").id, model.geom("c").id))}
+    truth = -min((c.dist for c in data.contact if frozenset(map(int, c.geom)) in names), default=0.0)
+    assert depth is None or abs(truth - depth) < 1e-6
+    if truth < 1e-3:
+        assert not found
+    else:
+        (words,) = found
+        assert "1 pair(s)" in words and f"a with c by {1e3 * truth:.3g} mm;" in words
+        assert recwarn.list[0].filename == __file__

@@ -17,6 +17,7 @@ from ..scene.collision_shapes import ShapeSelection
 from ..scene.contact_checks import unsaid_softness
 from ..scene.contact_values import TURNING_VALUES
 from ..scene.ground import GROUND_VALUES
+from ..scene.pair_overlaps import warn_of_overlaps
 from ..scene.scene import Scene
 from ..scene.shape_pairs import PairSelection, ShapePair
 from .model_contacts import CONTACT_MATERIALS, ModelShapes, model_contacts
@@ -97,7 +98,11 @@ def with_model_contacts(model: newton.Model, worlds: WorldRows, scene: Scene, se
         scene, left_out = made.scene, made.selected.left_out
     if left_out + lost:
         warnings.warn(f"from_newton: left out: {', '.join(left_out + lost)}", UserWarning, stacklevel=3)
-    return scene if pairs is None else pairs.added_to(scene)
+    if pairs is None:
+        return scene
+    touching_scene = pairs.added_to(scene)
+    warn_of_overlaps("from_newton", touching_scene, len(scene.contacts))
+    return touching_scene
 
 
 class ModelPairs:

@@ -21,6 +21,7 @@ from .contact_values import NeutralPose
 from .contacts import FRICTIONS, Contact
 from .frames import pose_matrix
 from .ground import HeightField, Plane
+from .pair_overlaps import warn_of_overlaps
 
 if TYPE_CHECKING:
     from .scene import Scene
@@ -183,7 +184,11 @@ class ShapeSelection(NamedTuple):
                 found = self.resolve(call, scene, seen, touches, material_rule, complete)
                 contacts = [one for _, made in found.contacts_by_shape for one in made] + contacts
                 ground, left_out = found.ground, found.left_out + left_out
-            return scene.with_contacts(contacts, ground) if grounded or contacts else scene, left_out
+            if not grounded and not contacts:
+                return scene, left_out
+            made = scene.with_contacts(contacts, ground)
+            warn_of_overlaps(call, made, len(contacts) - len(touching))
+            return made, left_out
         except (ValueError, TypeError) as error:  # of a contact, which knows neither the call nor the file
             if not str(error).startswith(call):
                 error.args = (f"{call}: {error}",)
