@@ -21,7 +21,7 @@ from ...runtime import launches
 from ...scene.contact_shapes import BOX, ConvexShape
 from ...scene.ground import HEIGHTS
 from ...scene.scene import Scene
-from ..convex_contacts import PairShape, rotated, shape_rows
+from ..convex_contacts import PairShape, rotate, shape_rows
 from ..inertia import MASS_MATRIX_PACKED
 from ..kinematics import BODY_STATES
 
@@ -167,7 +167,7 @@ class JointSpaceStep:
         for pair in pairs:
             for body, shape in zip((pair.body, pair.other), pair.shapes, strict=True):
                 row = numbers[id(shape)]
-                at = shape.pose[:3] + rotated(shape.pose[3:], rows.middles[row])
+                at = shape.pose[:3] + rotate(shape.pose[3:], rows.middles[row])
                 sizes = shape.size + shape.radius
                 ball = float(np.linalg.norm(shape.size)) + shape.radius
                 if shape.hull is not None:
