@@ -92,6 +92,13 @@ struct joint_space
 
     static CUDA_CALLABLE inline bool lost(REAL x) { return !(x - x == 0); }
 
+    // By which share a law's line, and ``more`` of its size that is expected, meets its bound.
+    static CUDA_CALLABLE inline REAL share(const REAL* law, REAL line, REAL more)
+    {
+        const REAL size = size_of(line) + more, bound = positive(line > 0 ? law[3] : -law[2]);
+        return bound < size ? bound / size : 1;
+    }
+
     // Adds a point's force in its axes to one in inertial axes.
     static CUDA_CALLABLE inline void add_force(const REAL* normal, const REAL* f, int apart, REAL* to)
     {
@@ -129,7 +136,8 @@ alignas(64) char bytes[BYTES];
 #endif
 REAL* const s = (REAL*)bytes;
 Tile* const A = (Tile*)(s + AT_A);
-REAL *const J = s + AT_J, *const slot = s + AT_SLOT, *const dof = s + AT_DOF, *const held_mass = s + AT_M;
+REAL *const J = s + AT_J, *const slot = s + AT_SLOT, *const dof = s + AT_DOF, *const held_mass = s + AT_M,
+    *const shares = s + AT_SHARE;
 unsigned long long* const mask = (unsigned long long*)(bytes + AT_MASK);
 int *const run_start = (int*)(bytes + AT_RUN), *const run_couple = run_start + NEAR + SURFACES + 1;
 int *const slot_of = (int*)(bytes + AT_SLOT_OF), *const keep = (int*)(bytes + AT_KEEP);
@@ -141,6 +149,7 @@ const int* const table = place.data;
 const int* const nears = near.data + world * (1 + 2 * NEAR);
 const REAL* const touch = touches.data + world * (NEAR * MOST * POINT);
 const REAL* const surface = surfaces.data + world * surfaces.shape[1];
+const REAL* const motor = motors.data + world * motors.shape[1];
 const REAL* const dof_value = dof_values.data + (dof_values.shape[0] > 1 ? world : 0) * dof_values.shape[1];
 const REAL* const pair_value = pair_values.data + (pair_values.shape[0] > 1 ? world : 0) * pair_values.shape[1];
 const REAL half_gravity = pair_value[PV * (PAIRS + SURFACES)];

@@ -28,6 +28,8 @@ MOST, POINT = 8, 7  # points of a near pair; entries of a point: place, normal t
 SURFACE = 11
 """Entries of a surface of the ground at a point: place, normal, depth; push and damping of its law; gap; 1 where the
 point comes out slowly."""
+LAW = 5
+"""Entries of a law f(u) = scale clip(force - resistance u, least, most): force, resistance, least, most, scale."""
 DOF_FIELDS, SLOT_FIELDS = 12, 13
 DOF_VALUES = (
     "stiffness", "rest", "damping", "ke", "kd", "effort", "dry", "fastest", "brake", "weight",
@@ -39,7 +41,7 @@ PAIR_VALUES = ("stiffness", "damping", "friction", "eps", "weight")
 NUMBERS = ("h", "passes", "most_force", "most_effort")
 ARGUMENTS = [
     ("mass", 2), ("bias", 2), ("tau", 2), ("q", 2), ("qd", 2), ("target_q", 2), ("target_qd", 2), ("poses", 3),
-    ("near", 1), ("touches", 2), ("surfaces", 2), ("dof_values", 2), ("pair_values", 2), ("place", 1),
+    ("near", 1), ("touches", 2), ("surfaces", 2), ("motors", 2), ("dof_values", 2), ("pair_values", 2), ("place", 1),
     *((name, 0) for name in NUMBERS),
     ("out", 2), ("qdd", 2), ("contact_f", 3), ("contact_gap", 2), ("contact_slip", 2), ("excess", 2), ("status", 1),
 ]  # fmt: skip
@@ -61,6 +63,7 @@ class Sizes(NamedTuple):
         columns: block columns of a couple at most. near: pairs at most that are near in a world. slots: points at most,
             those with the ground among them.
         surfaces, points: surfaces of the ground at points, each of which has a slot; points with the ground.
+        laws: of motors and of springs, beside those that follow from constants of a dof.
     """
 
     dofs: int
@@ -73,6 +76,7 @@ class Sizes(NamedTuple):
     slots: int
     surfaces: int = 0
     points: int = 0
+    laws: int = 0
 
     @property
     def words(self) -> int:
@@ -86,7 +90,7 @@ class Sizes(NamedTuple):
             "DOF_OF": 2 * self.tiles, "ENTRY": self.entries, "MASK": 2 * self.tiles * self.words,
             "COUPLE": (1 + self.columns) * self.couples, "PAIR": 2 * (self.pairs + self.surfaces),
             "AXIS_BODY": self.dofs, "POINT_BODY": self.dofs, "COORDINATE": self.dofs, "ROW_START": 2 * self.tiles + 1,
-            "ROW": 2 * self.entries - self.dofs,
+            "ROW": 2 * self.entries - self.dofs, "LAW": self.dofs + 1,
         }  # fmt: skip
         starts, at = {}, 0
         for name, size in sizes.items():
@@ -101,6 +105,7 @@ def shared_layout(sizes: Sizes, T: type) -> tuple[dict[str, int], int]:
     reals = {
         "AT_A": max(4 * (b * (b + 1) // 2 + b), 6 * sizes.dofs, 5 * BLOCK), "AT_J": 6 * sizes.columns * sizes.slots,
         "AT_SLOT": SLOT_FIELDS * sizes.slots, "AT_DOF": DOF_FIELDS * 2 * b, "AT_M": sizes.entries,
+        "AT_SHARE": sizes.laws,
     }  # fmt: skip
     for name, size in reals.items():
         starts[name], at = at, at + -(-size // 4) * 4
@@ -134,7 +139,7 @@ def solver(sizes: Sizes, T: type, lanes: int = 32, registers: int | None = None,
         "MB": sizes.columns, "NEAR": sizes.near, "S": sizes.slots, "BYTES": size, "MOST": MOST, "POINT": POINT,
         "DV": len(DOF_VALUES), "PV": len(PAIR_VALUES), "TILES": sizes.tiles * (sizes.tiles + 1) // 2 + sizes.tiles,
         "REFINE": refine, "SURFACE": SURFACE, "SURFACES": sizes.surfaces, "CONTACT_POINTS": sizes.points,
-        "WORDS": sizes.words,
+        "WORDS": sizes.words, "LAW": LAW, "LAWS": sizes.laws,
     }  # fmt: skip
     constants |= WORDS | starts | {f"T_{name}": at for name, at in sizes.table_starts.items()}
     constants |= {f"C_{name.upper()}": i for i, name in enumerate(DOF_VALUES)}

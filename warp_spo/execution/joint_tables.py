@@ -36,12 +36,17 @@ class JointTables(NamedTuple):
 
 
 def joint_tables(
-    scene: Scene, pattern: tuple[np.ndarray, np.ndarray], near: int, slots: int, surfaces: list[range]
+    scene: Scene,
+    pattern: tuple[np.ndarray, np.ndarray],
+    near: int,
+    slots: int,
+    surfaces: list[range],
+    motors: tuple[int, ...],
 ) -> JointTables:
     """Return the tables of a scene whose packed mass matrix has rows and columns ``pattern``.
 
     ``near``: pairs at most that are near in a world. ``slots``: points of pairs at most. ``surfaces``: of each point
-    with the ground, the numbers of the surfaces that it may touch.
+    with the ground, the numbers of the surfaces that it may touch. ``motors``: see :func:`motor_laws`.
     """
     dofs_of = _dofs_by_body(scene)
     ways = _ways(scene)
@@ -53,10 +58,12 @@ def joint_tables(
     rows, cols = pattern
     sizes = joint_space.Sizes(
         scene.dof_count, tiles, len(rows), len(pairs), len(couples), max(map(len, columns), default=0), near,
-        slots + sum(map(len, surfaces)), sum(map(len, surfaces)), len(surfaces),
+        slots + sum(map(len, surfaces)), sum(map(len, surfaces)), len(surfaces), sum(motors),
     )  # fmt: skip
     entries, masks = _entries(rows, cols, position, tiles)
     axis_body, point_body, coordinate, dof_values = _dofs(scene)
+    own = [joint_space.DOF_VALUES.index(name) for name in ("stiffness", "ke", "kd")]
+    dof_values[np.ix_(np.flatnonzero(motors), np.array(own))] = 0.0
     table: list[int] = [*order, *entries]
     table += [(mask >> shift) & 0xFFFFFFFF for mask in masks for shift in range(0, 64 * sizes.words, 32)]
     for each in columns:
@@ -71,6 +78,7 @@ def joint_tables(
         for i, j in {tuple(both), tuple(both[::-1])}:
             met[position[i]].append(entry << 8 | position[j])
     table += [*np.cumsum([0, *map(len, met)]).tolist(), *(x for row in met for x in sorted(row))]
+    table += np.cumsum([0, *motors]).tolist()
     assert len(table) == sizes.table_starts["END"]
     place = np.array(table, dtype=np.int64).astype(np.uint32).view(np.int32)
     return JointTables(sizes, place, np.ravel(dof_values), _pair_values(scene, pairs, numbers), pairs)
@@ -82,11 +90,6 @@ def lacking(scene: Scene, variable: tuple[str, ...]) -> str:
     lacks = [f"{kind} hinges" for kind in sorted({hinge.kind for hinge in scene.hinges} - HINGES)]
     lacks += ["hinges that share dofs"] * bool(scene.shares_dofs)
     lacks += ["bodies with modes"] * any(body.modes is not None for body in scene.bodies)
-    lacks += ["actuators"] * bool(scene.actuators)
-    turns = [(hinge.kind in ("free", "ball"), dofs) for hinge, dofs in zip(scene.hinges, _dofs_of(scene), strict=True)]
-    for name in ("joint_stiffness", "joint_target_ke"):
-        some = name in variable or any(scene.values[name][:, dofs].any() for turn, dofs in turns if turn)
-        lacks += [f"{name} of ball and free hinges"] * (some and any(turn for turn, _ in turns))
     for name in ("joint_X_p", "joint_X_c", "body_com"):
         varies = name in variable or (scene.values[name] != scene.values[name][:1]).any()
         lacks += [f"{name} that varies between worlds"] * bool(varies)
@@ -101,6 +104,24 @@ def lacking(scene: Scene, variable: tuple[str, ...]) -> str:
     if not lacks and len(_order(scene, _dofs_by_body(scene), _ways(scene))) > MOST_PLACES:
         lacks.append(f"{scene.dof_count} dofs")
     return lacks[0] if lacks else ""
+
+
+def motor_laws(scene: Scene, variable: tuple[str, ...]) -> tuple[int, ...]:
+    """Return how many laws of its spring, drive and actuators each dof has that are computed with the bias force.
+
+    They are those of dofs with actuators, and of ball and free hinges with springs or position drives.
+    """
+    counts = np.zeros(scene.dof_count, dtype=int)
+    for actuator in scene.actuators:
+        for hinge in actuator.hinges:
+            counts[scene.qd_start[hinge]] += 1
+    counts[counts > 0] += 2
+    for hinge, dofs in zip(scene.hinges, _dofs_of(scene), strict=True):
+        if hinge.kind in ("free", "ball"):
+            for name in ("joint_stiffness", "joint_target_ke"):
+                some = name in variable or scene.values[name][:, dofs].any()
+                counts[dofs] = np.maximum(counts[dofs], 2 * bool(some))
+    return tuple(counts.tolist())
 
 
 def _dofs_of(scene: Scene) -> list[np.ndarray]:

@@ -70,7 +70,7 @@ class StepReport(Mapping[str, Any]):
               over substeps. The points are ``scene.contact_points``; after them, for each of ``scene.contact_pairs``,
               comes the force of the other body on the first one.
             * ``contact_gap``: distance of each point from the ground [world, contact] [m], negative inside, at the q
-              that the step starts from; of a pair at its deepest point, infinite where no faces meet, or, in joint space,
+              that the step starts from; of a pair at its deepest point, infinite where no faces meet, or in joint space
               where the two are not near each other.
             * ``contact_slip``: speed of each point along the ground after the step [world, contact] [m/s]; of a pair
               that of its deepest point along the other body.

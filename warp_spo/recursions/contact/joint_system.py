@@ -16,16 +16,20 @@ from ...trace.spatial import ZERO, Vector, dot, total
 from ..kinematics import zero
 from ..newton_euler import inverse_dynamics
 from ..step.actuation import build_joint_laws
-from ..step.joint_laws import JointLaws
+from ..step.joint_laws import JointLaws, Law, add_laws
 from .pairs import place_axes_of
 from .points import place_points, with_ancestors
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace
 
-SURFACES, OF_DOFS, OF_PAIRS = "surfaces", "dof_values", "pair_values"
+SURFACES, OF_DOFS, OF_PAIRS, OF_MOTORS = "surfaces", "dof_values", "pair_values", "motors"
 SURFACE = 11
 """Entries of a surface: place, normal, depth; push and damping of its law; gap; 1 where the point comes out slowly."""
+LAW = 5
+"""Entries of a law f(u) = scale clip(force - resistance u, least, most) of OF_MOTORS: force, resistance, least, most,
+scale; UNBOUNDED where there is no bound."""
+UNBOUNDED = 1e30
 AWAY = -1e3  # depth of a point that cannot move [m]
 LAWS = {
     "stiffness": "joint_stiffness", "damping": "joint_damping", "ke": "joint_target_ke", "kd": "joint_target_kd",
@@ -41,17 +45,23 @@ OTHERS = (
 
 
 def joint_system(
-    trace: Trace, surfaces: bool, pairs: tuple[int, ...], names: tuple[tuple[str, ...], tuple[str, ...]] | None = None
+    trace: Trace,
+    surfaces: bool,
+    pairs: tuple[int, ...],
+    motors: tuple[int, ...],
+    names: tuple[tuple[str, ...], tuple[str, ...]] | None = None,
 ) -> list[Store]:
-    """out = bias force, with gravity compensation; SURFACES; OF_DOFS and OF_PAIRS, those that are no constants
+    """out = bias force, with gravity compensation; SURFACES; OF_MOTORS; OF_DOFS and OF_PAIRS that are no constants
 
     ``surfaces``: whether points may touch the ground. ``names``: of the values of dofs, and of pairs; None: all are
-    constants. ``pairs``: the order of the scene's pairs, after which the surfaces follow.
+    constants. ``pairs``: the order of the scene's pairs, after which the surfaces follow. ``motors``: by dof, how many
+    laws of its spring, drive and actuators OF_MOTORS has.
     """
     trace.compensate_gravity()
     laws = build_joint_laws(trace, trace.graph.input("dt", 0))
     stores = list(inverse_dynamics(trace, qdd=zero, letter="f"))
     numbers = _add_surfaces(trace, laws, stores) if surfaces else []
+    stores += _motor_laws(trace, laws, motors)
     if names is not None:
         first = len(trace.links.scene.contact_points)
         rows = [*(first + pair for pair in pairs), *numbers]
@@ -81,6 +91,26 @@ def _add_surfaces(trace: Trace, laws: JointLaws, stores: list[Store]) -> list[in
         row = [*place, *normal, *law, point.gap, 0.0 if still else point.deep]
         stores += [Store(SURFACES, (SURFACE * at + i,), value) for i, value in enumerate(row)]
     return [point.number for point in points]
+
+
+def _motor_laws(trace: Trace, laws: JointLaws, motors: tuple[int, ...]) -> list[Store]:
+    found: list[Store] = []
+    for link in trace.active_links:
+        for i, dof in enumerate(link.dofs):
+            if not motors[dof]:
+                continue
+            trace.label(link, "m")
+            every = laws.springs_and_motors(link, i)
+            loose = [law for law in every if not law.has_bounds]
+            rows = [add_laws(loose)] * bool(loose) + [law for law in every if law.has_bounds]
+            assert len(rows) <= motors[dof]
+            rows += [Law(0.0, 0.0)] * (motors[dof] - len(rows))
+            for at, law in enumerate(rows, start=sum(motors[:dof])):
+                least = -UNBOUNDED if law.least is None else law.least
+                most = UNBOUNDED if law.most is None else law.most
+                values = (law.force, law.resistance, least, most, law.scale)
+                found += [Store(OF_MOTORS, (LAW * at + c,), value) for c, value in enumerate(values)]
+    return found
 
 
 def _dof_values(trace: Trace, laws: JointLaws, names: tuple[str, ...]) -> list[Store]:
