@@ -128,6 +128,7 @@ class JointSpaceStep:
         self.near = make(self.worlds * (1 + 2 * near), dtype=int)
         self.touches = make(self.worlds, near * joint_space.MOST * joint_space.POINT)
         self.surfaces = make(self.worlds, max(1, sizes.surfaces * joint_space.SURFACE))
+        self.screws = make(self.worlds, scene.dof_count * joint_space.SCREW)
         self.motors = make(self.worlds, max(1, sizes.laws * joint_space.LAW))
         n, contacts = scene.dof_count, scene.contact_count
         self.neutral = array(np.tile(scene.neutral_q, (self.worlds, 1)))
@@ -214,7 +215,7 @@ class JointSpaceStep:
         """
         tau, (target_q, target_qd) = self.still if tau is None else tau, targets
         system = [self.mass, self.bias, tau, q, qd, self.neutral if target_q is None else target_q]
-        system += [self.still if target_qd is None else target_qd, self.poses, self.near, self.touches, self.surfaces]
+        system += [self.still if target_qd is None else target_qd, self.screws, self.near, self.touches, self.surfaces]
         system += [self.motors, self.dof_values, self.pair_values, self.place]
         names = "qd_out", "qdd", "contact_f", "contact_gap", "contact_slip", "excess", "status"
         out = [(results or {}).get(name, getattr(self, name)) for name in names]
@@ -230,7 +231,8 @@ class JointSpaceStep:
         engine, sizes = self.dyn._engine, self.tables.sizes
         engine.launch(MASS_MATRIX_PACKED, self.mass, q=q)
         engine.launch(BODY_STATES, self.poses, {"velocities_out": self.velocities}, q=q, qd=qd)
-        more = {joint_system.SURFACES: self.surfaces} if sizes.surfaces else {}
+        more = {joint_system.SCREWS: self.screws}
+        more |= {joint_system.SURFACES: self.surfaces} if sizes.surfaces else {}
         if self.names is not None:
             more |= {joint_system.OF_DOFS: self.dof_values, joint_system.OF_PAIRS: self.pair_values}
         if sizes.laws:
