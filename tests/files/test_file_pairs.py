@@ -251,11 +251,12 @@ def test_pairs_of_a_model_are_those_of_newton():
 
 
 # -- scenes ------------------------------------------------------------------------------------------------------------
-def test_pairs_all_of_a_file_are_contacts_of_the_scene(tmp_path, recwarn):
+@pytest.mark.parametrize("options", [dict(contacts=True), dict(contacts="ground", pairs="all")])
+def test_contacts_true_are_those_of_the_file(options, tmp_path, recwarn):
     """Of bodies and with what stands still, which is then not left out; forces on what moves; names choose some."""
     file = tmp_path / "gripper.xml"
     file.write_text(GRIPPER)
-    scene = spo.load(file, contacts="ground", pairs="all")
+    scene = spo.load(file, **options)
     labels = {c.label: c.friction for c in scene.contacts if c.other is not None}
     assert labels == {
         "palm with table": 1.0, "left with table": 1.2, "right with table": 0.9, "cube with table": 1.0,
@@ -285,7 +286,7 @@ def test_a_warning_names_what_is_left_out(off, pairs):
         r"'side' of body 'cube' \(pairs='all' takes them; contacts='ground' or pairs=\[\] says that there are none\)"
     )
     with pytest.warns(UserWarning, match=words):
-        scene = spo.from_mujoco(model, contacts="*" if off == "" else True)
+        scene = spo.from_mujoco(model, contacts="*")
     assert scene.contacts and not scene.contact_pairs
     with pytest.warns(UserWarning, match=r"left out: contacts of 3 geom\(s\), geom 'floor' among them"):
         spo.from_mujoco(model)
@@ -301,7 +302,8 @@ def test_contacts_with_the_ground_alone_warn_of_no_bodies(options, recwarn):
 def test_no_warning_where_bodies_only_touch_the_ground(recwarn):
     text = TEXT.format("", "").replace('name="palm" size=".1"', 'name="palm" size=".1" contype="2" conaffinity="1"')
     text = text.replace('name="side"', 'name="side" contype="4" conaffinity="1"')
-    assert len(spo.from_mujoco(mujoco.MjModel.from_xml_string(text), contacts=True).contacts) == 2
+    for contacts in (True, "*"):
+        assert len(spo.from_mujoco(mujoco.MjModel.from_xml_string(text), contacts=contacts).contacts) == 2
     assert not recwarn.list
 
 
@@ -323,6 +325,52 @@ def test_what_pairs_do_not_take_is_said():
     with pytest.warns(UserWarning, match="all contacts, which its options disable"):
         assert not spo.from_mujoco(model, contacts="ground", pairs="all").contacts
     assert len(quiet(spo.from_mujoco, model, pairs=[("palm", "side")]).contact_pairs) == 1
+
+
+def test_pairs_that_no_step_takes_are_left_out_of_true_and_refused_of_all():
+    """Ant's 44 where it has actuators; the same without them are taken."""
+    with pytest.warns(
+        UserWarning, match=r"44 pair\(s\) of shapes, such as .*, because steps of a scene with actuators"
+    ):
+        scene = spo.load(shipped("ant"), contacts=True)
+    assert not scene.contact_pairs and len(scene.contact_points) == 25
+    spec = mujoco.MjSpec.from_file(str(shipped("ant")))
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    scene = quiet(spo.from_mujoco, spec.compile(), contacts=True)
+    assert (len(scene.contact_pairs), len(scene.contact_points)) == (44, 25)
+
+
+def test_contacts_true_of_a_model_and_a_urdf_have_their_pairs(tmp_path):
+    """Materials of a pair are means, which may differ between worlds; a ball on a post of a URDF touches nothing."""
+    one = newton.ModelBuilder()
+    config = newton.ModelBuilder.ShapeConfig
+    for mu in (0.2, 0.6):
+        one.add_shape_sphere(one.add_body(), radius=0.1, cfg=config(mu=mu, ke=1e3 * mu, kd=5.0))
+    one.add_shape_box(-1, hx=0.1, hy=0.1, hz=0.1, cfg=config(mu=1.0, ke=3e3, kd=7.0), label="post")
+    many = newton.ModelBuilder()
+    many.replicate(one, 2)
+    many.add_ground_plane()
+    model = many.finalize(device="cpu")
+    mu = model.shape_material_mu.numpy()
+    mu[4] = 0.8  # the second ball of the second world
+    model.shape_material_mu.assign(mu)
+    scene = spo.from_newton(model, contacts=True)
+    assert (len(scene.contact_points), len(scene.contact_pairs)) == (2, 3)
+    assert sorted((pair.body, pair.other) for pair in scene.contact_pairs) == [(0, -1), (0, 1), (1, -1)]
+    rows = {(pair.body, pair.other): 2 + i for i, pair in enumerate(scene.contact_pairs)}
+    friction = scene.values["contact_friction"]
+    np.testing.assert_allclose(friction[:, rows[0, 1]], [0.4, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(scene.values["contact_stiffness"][0, rows[1, -1]], 1.8e3, rtol=1e-6)
+    np.testing.assert_allclose(scene.values["contact_damping"][0, rows[1, -1]], 6.0, rtol=1e-6)
+    file = tmp_path / "robot.urdf"
+    joints = "".join(
+        f"""<joint name="j{i}" type="continuous"><origin xyz="0.3 0 0"/><parent link="l{i - 1}"/><child link="l{i}"/>
+        <axis xyz="0 0 1"/></joint>"""
+        for i in (1, 2)
+    )
+    file.write_text(f'<robot name="r">{"".join(link(f"l{i}") for i in range(3))}{joints}</robot>')
+    assert [c.label for c in spo.load(file, floating=True, contacts=True).contacts[-1:]] == ["r/l0 with r/l2"]
 
 
 @pytest.mark.parametrize("pairs, error, words", [

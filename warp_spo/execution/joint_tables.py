@@ -103,6 +103,12 @@ def lacking(scene: Scene, variable: tuple[str, ...]) -> str:
     return lacks[0] if lacks else ""
 
 
+def why_few_pairs(scene: Scene) -> str:
+    """Return why steps of a scene take only few pairs, whose code is generated; "" if joint space takes many."""
+    lacks = lacking(scene, ())
+    return f"steps of a scene with {lacks} do not solve so many" if lacks else ""
+
+
 def _dofs_of(scene: Scene) -> list[np.ndarray]:
     """Return the dofs of each hinge."""
     return [np.arange(a, b) for a, b in zip(scene.qd_start[:-1], scene.qd_start[1:], strict=True)]
