@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from ..errors import UnsupportedError, as_integer
 from .collision_shapes import ALL, GROUNDS, CollisionShape
-from .contact_shapes import SHAPES, ContactShape
+from .contact_shapes import FACES, SHAPES, ContactShape
 from .contacts import FRICTIONS, Contact
 
 if TYPE_CHECKING:
@@ -97,6 +97,7 @@ class PairSelection:
     takes_still: bool = False
     why_few: Callable[[Scene], str] | None = None
     _pieces: list[int] = dataclasses.field(init=False)
+    _faces: dict[int, int] = dataclasses.field(default_factory=dict, init=False)
     _lacking: dict[int, str] = dataclasses.field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
@@ -233,7 +234,18 @@ class PairSelection:
 
     def _stands(self, pair: ShapePair) -> bool:
         """Whether a contact can stand for a pair."""
-        return pair.fits and not any(map(self._lacks, pair))
+        if not pair.fits or any(map(self._lacks, pair)):
+            return False
+        faces = [self._largest_face(shape) for shape in pair]
+        return 0 in faces or {shape.kind for shape in pair} == {"box"} or sum(faces) <= FACES
+
+    def _largest_face(self, shape: CollisionShape) -> int:
+        """Return how many corners the largest face of a shape has; 0 of a round one."""
+        if shape.index not in self._faces:
+            convex = shape.contact_shape().grown(0.0).convex(self.call) if shape.kind in ("box", "hull") else None
+            hull = None if convex is None else convex.hull
+            self._faces[shape.index] = 0 if convex is None else 4 if hull is None else max(map(len, hull.faces))
+        return self._faces[shape.index]
 
     def _lacks(self, shape: CollisionShape) -> str:
         """Return why no contact can have a shape of its kind; "" if one can."""
