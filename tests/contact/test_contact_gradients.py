@@ -253,7 +253,7 @@ def test_a_tape_differentiates_the_solver():
     seeds = np.random.default_rng(0).normal(size=(2, 6)).astype(np.float32)
     tape.backward(grads={states[-1].joint_qd: wp.array(seeds.ravel(), device="cpu")})
 
-    scene = spo.from_newton(model, contacts=True)
+    scene = spo.from_newton(model, contacts="ground")
     dyn = spo.Dynamics(scene, 2, "cpu", "float64", variable=("contact_friction",))
     mu = np.array(np.broadcast_to(scene.values["contact_friction"], (2, scene.contact_count)), dtype=float)
 

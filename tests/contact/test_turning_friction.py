@@ -279,7 +279,7 @@ def test_friction_of_files_is_mujocos(floor, tmp_path):
         slide, _, spin, roll, _ = contact.friction
         values = [value if contact.dim >= least else 0.0 for value, least in ((slide, 3), (spin, 4), (roll, 6))]
         wanted[model.geom(contact.geom[1]).name or model.geom(contact.geom[0]).name] = values
-    scene = spo.load(file, contacts=True)
+    scene = spo.load(file, contacts="ground")
     found = {one.label: [one.friction, one.torsional_friction, one.rolling_friction] for one in scene.contacts}
     assert len(found) == 7 and found.keys() == wanted.keys()
     for name, values in wanted.items():
@@ -290,7 +290,7 @@ def test_a_pair_that_rolls_differently_along_and_across_is_said_to_be_left_out(t
     file = tmp_path / "pair.xml"
     file.write_text(RUBBED.format(floor="").replace("0.03 0.01 0.01", "0.03 0.01 0.02"))
     with pytest.warns(UserWarning, match="the rolling friction 0.02 across of a contact pair of geom 'listed'"):
-        scene = spo.load(file, contacts=True)
+        scene = spo.load(file, contacts="ground")
     assert {one.label: one.rolling_friction for one in scene.contacts}["listed"] == 0.01
 
 
@@ -302,7 +302,7 @@ def test_friction_of_urdf_is_bullets(tmp_path):
     shape = '<collision><geometry><sphere radius="0.1"/></geometry></collision>'
     mass = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
     file.write_text(f'<robot name="r"><link name="a">{mass}{shape}<contact>{given}</contact></link></robot>')
-    (contact,) = spo.load(file, floating=True, contacts=True).contacts
+    (contact,) = spo.load(file, floating=True, contacts="ground").contacts
     assert (contact.friction, contact.torsional_friction, contact.rolling_friction) == (0.8, SPIN, ROLL)
 
 

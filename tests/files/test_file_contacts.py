@@ -106,7 +106,7 @@ def random_q(model, rng):
 def test_shapes_of_a_mujoco_model_are_its_geoms():
     """Types, frames, fixed children, fromto, classes, meshes that MuJoCo recentres; round ones to their points."""
     model, rng = compiled(), np.random.default_rng(1)
-    scene = quiet(spo.from_mujoco, model, contacts=True, points=64)
+    scene = quiet(spo.from_mujoco, model, contacts="ground", points=64)
     assert {c.label for c in scene.contacts} == {"ball", "can", "slab", "shell", "lens", "prism", "rod", "toe"}
     for _ in range(5):
         qpos = random_q(model, rng)
@@ -120,15 +120,15 @@ def test_shapes_of_a_mujoco_model_are_its_geoms():
 
 def test_friction_is_that_of_mujoco_on_its_ground():
     """The larger of both, or that of the geom with priority, or none of one dimension; the plane is the ground."""
-    scene = quiet(spo.from_mujoco, compiled(), contacts=True)
+    scene = quiet(spo.from_mujoco, compiled(), contacts="ground")
     friction = {c.label: c.friction for c in scene.contacts}
     assert friction["ball"] == 0.7 and friction["rod"] == 0.7 and friction["can"] == 0.2
     pair = '<contact><pair geom1="shell" geom2="floor" friction="0.9 0.9 0.1 0.1 0.1"/></contact></mujoco>'
     paired = MJCF.replace('condim="1"', 'contype="0" conaffinity="0"').replace("</mujoco>", pair)
-    friction = {c.label: c.friction for c in quiet(spo.from_mujoco, compiled(paired), contacts=True).contacts}
+    friction = {c.label: c.friction for c in quiet(spo.from_mujoco, compiled(paired), contacts="ground").contacts}
     assert friction["shell"] == 0.9
     frictionless = MJCF.replace('name="floor"', 'name="floor" condim="1"')
-    friction = {c.label: c.friction for c in quiet(spo.from_mujoco, compiled(frictionless), contacts=True).contacts}
+    friction = {c.label: c.friction for c in quiet(spo.from_mujoco, compiled(frictionless), contacts="ground").contacts}
     assert friction["shell"] == 0.0 and friction["ball"] == 0.7
     np.testing.assert_allclose(scene.ground.height, 0.1 * np.cos(np.radians(10)), atol=EXACT)
     np.testing.assert_allclose(
@@ -246,12 +246,12 @@ def test_shapes_of_a_urdf_are_where_mujoco_has_them(urdf):
     model, rng = mujoco.MjModel.from_xml_path(str(urdf)), np.random.default_rng(3)
     assert model.nbody == 2  # base and cap are the world, as in the scene that does not float
     with pytest.warns(UserWarning, match="left out: box 'r/base:0' of body 'r/base', sphere 'pad' of body"):
-        scene = spo.load(urdf, contacts=True, points=64)
+        scene = spo.load(urdf, contacts="ground", points=64)
     assert [c.label for c in scene.contacts] == ["r/foot"] and scene.contacts[0].friction == 0.6
     for q in rng.uniform(-1, 1, (3, 1)):
         (want,) = geoms(model, q).values()
         assert abs(lowest(scene, q)["r/foot"] - want) < SINGLE
-    free = spo.load(urdf, floating=True, contacts=True, points=64)
+    free = spo.load(urdf, floating=True, contacts="ground", points=64)
     assert {c.label: c.friction for c in free.contacts} == {"r/base:0": 0.8, "pad": 0.8, "r/cap": 0.3, "r/foot": 0.6}
     heights = lowest(free, np.array([0, 0, 0, 0, 0, 0, 1, 0.4]))
     data = mujoco.MjData(model)
@@ -269,7 +269,7 @@ def test_a_file_of_a_mesh_that_is_missing_is_named_only_if_needed(tmp_path):
     file.write_text(URDF.format(fused="true", mass=MASS, mesh="package://lost/wedge.stl"))
     spo.load(file)
     with pytest.raises(ValueError, match=r"line 10, <mesh>: there is no file 'package://lost/wedge.stl'.*contacts="):
-        spo.load(file, contacts=True)
+        spo.load(file, contacts="ground")
     (tmp_path / "wedge.stl").write_bytes(b"solid nothing")
     file.write_text(URDF.format(fused="true", mass=MASS, mesh="wedge.stl"))
     with pytest.raises(ValueError, match=r"line 10, <mesh>: its file (cannot be read|has no vertices)"):
@@ -321,7 +321,7 @@ SUPPORTS = {  # lowest height of Newton's shapes of scale s about their centre; 
 def test_shapes_of_a_newton_model_are_where_newton_has_them():
     """Against support functions of Newton's shapes in Newton's own body poses."""
     model = newton_model()
-    scene = spo.from_newton(model, contacts=True, points=64)
+    scene = spo.from_newton(model, contacts="ground", points=64)
     state, rng = model.state(), np.random.default_rng(5)
     q = rng.uniform(-1, 1, scene.coord_count)
     q[3:7] /= np.linalg.norm(q[3:7])
@@ -341,9 +341,11 @@ def test_shapes_of_a_newton_model_are_where_newton_has_them():
 
 def test_a_newton_model_without_a_plane_has_no_floor():
     model = newton_model(ground=lambda builder: None)
-    with pytest.warns(UserWarning, match=r"from_newton: left out: all contacts, because there is no plane"):
-        assert not spo.from_newton(model, contacts=True).contacts
-    assert spo.from_newton(model, contacts=True, ground=spo.Plane()).contacts
+    with pytest.warns(
+        UserWarning, match=r"from_newton: left out: all contacts with a ground, because there is no plane"
+    ):
+        assert not spo.from_newton(model, contacts="ground").contacts
+    assert spo.from_newton(model, contacts="ground", ground=spo.Plane()).contacts
 
 
 def test_materials_of_a_newton_model_are_means_with_its_ground():
@@ -352,11 +354,11 @@ def test_materials_of_a_newton_model_are_means_with_its_ground():
     mu = model.shape_material_mu.numpy()
     mu[12] = 0.1  # the first shape of world 1
     model.shape_material_mu.assign(mu)
-    scene = spo.from_newton(model, contacts=True)
+    scene = spo.from_newton(model, contacts="ground")
     assert scene.values["contact_stiffness"].tolist() == [[3e3] * len(scene.contact_points)]
     assert scene.values["contact_damping"][0, 0] == 20.0
     np.testing.assert_allclose(scene.values["contact_friction"][:, :2], [[0.7, 0.7], [0.5, 0.7]], atol=1e-7)
-    alone = spo.from_newton(model, contacts=True, ground=spo.Plane())
+    alone = spo.from_newton(model, contacts="ground", ground=spo.Plane())
     np.testing.assert_allclose(alone.values["contact_friction"][:, :2], [[0.5, 0.5], [0.1, 0.5]], atol=1e-7)
     assert alone.values["contact_stiffness"][0, 0] == 4e3
 
@@ -379,7 +381,7 @@ def test_what_newton_lets_pass_has_no_contact():
 ])  # fmt: skip
 def test_what_stands_still_and_is_no_ground_is_left_out_by_name(ground, words):
     with pytest.warns(UserWarning, match=words):
-        spo.from_newton(newton_model(1, ground=ground), contacts=True)
+        spo.from_newton(newton_model(1, ground=ground), contacts="ground")
 
 
 def test_a_turned_height_field_is_refused():
@@ -387,7 +389,7 @@ def test_a_turned_height_field_is_refused():
 
     def on(*pose):
         add = lambda b: b.add_shape_heightfield(heightfield=field, xform=wp.transform(*pose))  # noqa: E731
-        return spo.from_newton(newton_model(1, ground=add), contacts=True).ground
+        return spo.from_newton(newton_model(1, ground=add), contacts="ground").ground
 
     with pytest.raises(spo.UnsupportedError, match=r"height field .* whose axes are turned"):
         on((0, 0, 0), wp.quat(0, 0, 0.6, 0.8))
@@ -407,7 +409,7 @@ def test_worlds_with_different_shapes_are_refused():
     model = builder.finalize(device="cpu")
     assert not spo.from_newton(model).contacts
     with pytest.raises(spo.UnsupportedError, match=r"world 1 differs in shape_scale"):
-        spo.from_newton(model, contacts=True)
+        spo.from_newton(model, contacts="ground")
 
 
 def test_reduced_hulls_keep_what_reaches_farthest():

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import warp_spo as spo
+from warp_spo.mujoco import Coordinates
 from warp_spo.mujoco.geom_pairs import geom_pairs
 from warp_spo.mujoco.mjcf import compiled
 from warp_spo.mujoco.source import Source
@@ -21,6 +22,7 @@ from warp_spo.newton.model_contacts import ModelShapes
 from warp_spo.newton.pairs import select_pairs
 from warp_spo.newton.worlds import WorldRows
 from warp_spo.scene.collision_shapes import moving_bodies
+from warp_spo.scene.hulls import _remembered_hull
 from warp_spo.scene.shape_pairs import PairSelection
 
 EVERYWHERE = 1e3  # a margin, m
@@ -251,11 +253,12 @@ def test_pairs_of_a_model_are_those_of_newton():
 
 
 # -- scenes ------------------------------------------------------------------------------------------------------------
-def test_pairs_all_of_a_file_are_contacts_of_the_scene(tmp_path, recwarn):
+@pytest.mark.parametrize("options", [dict(contacts=True), dict(contacts="ground", pairs="all")])
+def test_contacts_true_are_those_of_the_file(options, tmp_path, recwarn):
     """Of bodies and with what stands still, which is then not left out; forces on what moves; names choose some."""
     file = tmp_path / "gripper.xml"
     file.write_text(GRIPPER)
-    scene = spo.load(file, contacts="ground", pairs="all")
+    scene = spo.load(file, **options)
     labels = {c.label: c.friction for c in scene.contacts if c.other is not None}
     assert labels == {
         "palm with table": 1.0, "left with table": 1.2, "right with table": 0.9, "cube with table": 1.0,
@@ -285,7 +288,7 @@ def test_a_warning_names_what_is_left_out(off, pairs):
         r"'side' of body 'cube' \(pairs='all' takes them; contacts='ground' or pairs=\[\] says that there are none\)"
     )
     with pytest.warns(UserWarning, match=words):
-        scene = spo.from_mujoco(model, contacts="*" if off == "" else True)
+        scene = spo.from_mujoco(model, contacts="*")
     assert scene.contacts and not scene.contact_pairs
     with pytest.warns(UserWarning, match=r"left out: contacts of 3 geom\(s\), geom 'floor' among them"):
         spo.from_mujoco(model)
@@ -301,7 +304,8 @@ def test_contacts_with_the_ground_alone_warn_of_no_bodies(options, recwarn):
 def test_no_warning_where_bodies_only_touch_the_ground(recwarn):
     text = TEXT.format("", "").replace('name="palm" size=".1"', 'name="palm" size=".1" contype="2" conaffinity="1"')
     text = text.replace('name="side"', 'name="side" contype="4" conaffinity="1"')
-    assert len(spo.from_mujoco(mujoco.MjModel.from_xml_string(text), contacts=True).contacts) == 2
+    for contacts in (True, "*"):
+        assert len(spo.from_mujoco(mujoco.MjModel.from_xml_string(text), contacts=contacts).contacts) == 2
     assert not recwarn.list
 
 
@@ -325,6 +329,69 @@ def test_what_pairs_do_not_take_is_said():
     assert len(quiet(spo.from_mujoco, model, pairs=[("palm", "side")]).contact_pairs) == 1
 
 
+def test_pairs_that_no_step_takes_are_left_out_of_true_and_refused_of_all():
+    """Ant's 44 where it has actuators; the same without them are taken."""
+    with pytest.warns(
+        UserWarning, match=r"44 pair\(s\) of shapes, such as .*, because steps of a scene with actuators"
+    ):
+        scene = spo.load(shipped("ant"), contacts=True)
+    assert not scene.contact_pairs and len(scene.contact_points) == 25
+    spec = mujoco.MjSpec.from_file(str(shipped("ant")))
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    scene = quiet(spo.from_mujoco, spec.compile(), contacts=True)
+    assert (len(scene.contact_pairs), len(scene.contact_points)) == (44, 25)
+
+
+def test_contacts_true_of_a_model_and_a_urdf_have_their_pairs(tmp_path):
+    """Materials of a pair are means, which may differ between worlds; a ball on a post of a URDF touches nothing."""
+    one = newton.ModelBuilder()
+    config = newton.ModelBuilder.ShapeConfig
+    for mu in (0.2, 0.6):
+        one.add_shape_sphere(one.add_body(), radius=0.1, cfg=config(mu=mu, ke=1e3 * mu, kd=5.0))
+    one.add_shape_box(-1, hx=0.1, hy=0.1, hz=0.1, cfg=config(mu=1.0, ke=3e3, kd=7.0), label="post")
+    many = newton.ModelBuilder()
+    many.replicate(one, 2)
+    many.add_ground_plane()
+    model = many.finalize(device="cpu")
+    mu = model.shape_material_mu.numpy()
+    mu[4] = 0.8  # the second ball of the second world
+    model.shape_material_mu.assign(mu)
+    scene = spo.from_newton(model, contacts=True)
+    assert (len(scene.contact_points), len(scene.contact_pairs)) == (2, 3)
+    assert sorted((pair.body, pair.other) for pair in scene.contact_pairs) == [(0, -1), (0, 1), (1, -1)]
+    rows = {(pair.body, pair.other): 2 + i for i, pair in enumerate(scene.contact_pairs)}
+    friction = scene.values["contact_friction"]
+    np.testing.assert_allclose(friction[:, rows[0, 1]], [0.4, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(scene.values["contact_stiffness"][0, rows[1, -1]], 1.8e3, rtol=1e-6)
+    np.testing.assert_allclose(scene.values["contact_damping"][0, rows[1, -1]], 6.0, rtol=1e-6)
+    file = tmp_path / "robot.urdf"
+    joints = "".join(
+        f"""<joint name="j{i}" type="continuous"><origin xyz="0.3 0 0"/><parent link="l{i - 1}"/><child link="l{i}"/>
+        <axis xyz="0 0 1"/></joint>"""
+        for i in (1, 2)
+    )
+    file.write_text(f'<robot name="r">{"".join(link(f"l{i}") for i in range(3))}{joints}</robot>')
+    assert [c.label for c in spo.load(file, floating=True, contacts=True).contacts[-1:]] == ["r/l0 with r/l2"]
+
+
+def test_hulls_whose_faces_are_too_large_together_are_left_out():
+    """Of 12 and 12 corners; one of them touches a box. A hull of many pairs is computed once."""
+    turn = np.linspace(0, 2 * np.pi, 13)[:-1]
+    points = [f"{np.cos(a)} {np.sin(a)} {z}" for z in (0, 1) for a in turn]
+    asset = f'<asset><mesh name="drum" vertex="{" ".join(points)}"/></asset>'
+    drums = '<body><freejoint/><geom name="{}" type="mesh" mesh="drum"/></body>'
+    box = '<body><freejoint/><geom name="box" type="box" size="1 1 1"/></body>'
+    bodies = drums.format("a") + drums.format("b") + box
+    model = mujoco.MjModel.from_xml_string(f"<mujoco>{asset}<worldbody>{bodies}</worldbody></mujoco>")
+    with pytest.warns(UserWarning, match="contacts of 1 pair.* such as hull 'a' of .* with hull 'b' of"):
+        scene = spo.from_mujoco(model, pairs="all")
+    assert {contact.label for contact in scene.contacts} == {"a with box", "b with box"}
+    before = _remembered_hull.cache_info().misses
+    quiet(spo.from_mujoco, model, pairs="all")
+    assert _remembered_hull.cache_info().misses == before
+
+
 @pytest.mark.parametrize("pairs, error, words", [
     ("all", spo.UnsupportedError, r"nv_ant.xml': pairs='all' of 44 pairs of shapes, more than 32"),
     ([("torso_geom", "nobody")], ValueError, r"nv_ant.xml': pairs holds 'nobody', which is no collision shape"),
@@ -333,6 +400,67 @@ def test_what_pairs_do_not_take_is_said():
 def test_pairs_that_cannot_be_are_errors(pairs, error, words):
     with pytest.raises(error, match=words):
         quiet(spo.load, shipped("ant"), contacts="ground", pairs=pairs)
+
+
+# -- steps -------------------------------------------------------------------------------------------------------------
+STACK = f"""<mujoco><worldbody><geom type="plane" size="1 1 1"/>{
+    "".join(
+        f'<body pos="{0.002 * i} 0 {0.05 + 0.1 * i}"><freejoint/><geom type="box" size=".05 .05 .05" mass="1"/></body>'
+        for i in range(3)
+    )
+}</worldbody></mujoco>"""
+FINGERS = "".join(
+    f'''<body pos="{0.05 * x} {0.05 * y} .02"><joint axis="{-y} {x} 0" range="-30 90" damping=".01" stiffness=".2"
+     armature=".0005"/><geom type="capsule" fromto="0 0 0 0 0 .04" size=".008" mass=".03"/>
+     <body pos="0 0 .05"><joint axis="{-y} {x} 0" range="-30 90" damping=".01" stiffness=".2" armature=".0005"/>
+      <geom type="capsule" fromto="0 0 0 0 0 .03" size=".008" mass=".02"/></body></body>'''
+    for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))
+)
+HAND = f"""<mujoco><worldbody><body name="palm" pos="0 0 .3"><geom name="palm" type="box" size=".05 .05 .01"/>{FINGERS}
+ </body><body name="cube" pos="0 0 .341"><freejoint/><geom name="cube" type="box" size=".03 .03 .03" mass=".1"/></body>
+ </worldbody></mujoco>"""
+G = 9.81
+
+
+def run(text, tau, steps):
+    """Return scene, places and the force of each pair by name after steps of 5 ms from a file's own first state."""
+    model = mujoco.MjModel.from_xml_string(text)
+    scene = quiet(spo.from_mujoco, model, contacts=True)
+    dyn = spo.Dynamics(scene, worlds=1, dtype="float64", device="cpu")
+    q = Coordinates(scene, model, worlds=1, dtype="float64", device="cpu").q(model.qpos0[None])
+    qd = np.zeros((1, scene.dof_count))
+    report = dyn.step_report("contact_f", like=q)
+    for step in range(steps):
+        q, qd = dyn.step(q, qd, tau(step)[None], dt=5e-3, report=report)
+    forces = report.contact_f[0, len(scene.contact_points) :]
+    names = [scene.contacts[pair.contact].label for pair in scene.contact_pairs]
+    return scene, q[0], dict(zip(names, forces, strict=True))
+
+
+@pytest.mark.slow
+def test_a_gripper_of_a_file_lifts_its_cube():
+    """With 20 N at each finger, by what the hand is pushed up: the cube goes with it."""
+    weight = (model := mujoco.MjModel.from_xml_string(GRIPPER)).body_subtreemass[model.body("hand").id] * G
+    lift = lambda step: np.concatenate([[weight + (2.0 + 0.2 * G if step > 40 else 0.0), 20.0, 20.0], np.zeros(6)])  # noqa: E731
+    _, q, force = run(GRIPPER, lift, 120)
+    assert q[0] > 0.05 and abs(q[5] - 0.07 - q[0]) < 1e-3
+    assert abs(force["left with cube"][0]) > 15.0 and not np.any(force["cube with table"])
+
+
+@pytest.mark.slow
+def test_a_cube_lies_in_a_hand_of_a_file():
+    scene, q, force = run(HAND, lambda step: np.zeros(14), 100)
+    assert len(scene.contact_pairs) == 41
+    np.testing.assert_allclose(force["cube with palm"], [0, 0, 0.1 * G], atol=1e-3)
+    np.testing.assert_allclose(q[-7:-4], [0, 0, 0.34], atol=2e-4)
+
+
+@pytest.mark.slow
+def test_boxes_of_a_file_stand_on_each_other():
+    scene, q, _ = run(STACK, lambda step: np.zeros(18), 200)
+    assert len(scene.contact_pairs) == 3
+    np.testing.assert_allclose(q[2::7], [0.05, 0.15, 0.25], atol=3e-4)
+    np.testing.assert_allclose(q[0::7], [0.0, 0.002, 0.004], atol=1e-4)
 
 
 OVERLAPPING = """<mujoco><asset><mesh name="tip" vertex="-1 -1 0 1 -1 0 1 1 0 -1 1 0 0 0 1" scale=".1 .1 .1"/></asset>

@@ -21,7 +21,7 @@ MARGINS = """<mujoco><option o_margin="0.07" o_friction="0.4 0.4 0.01 0.01 0.01"
 def test_margins_hold_shapes_where_mujoco_does(override):
     """Both margins, that of a pair, or the option's: depths are those of MuJoCo's constraints, frictions its own."""
     model, rng = mujoco.MjModel.from_xml_string(MARGINS.replace("{override}", override)), np.random.default_rng(2)
-    scene = spo.from_mujoco(model, contacts=True)
+    scene = spo.from_mujoco(model, contacts="ground")
     qpos = np.array([0.0, 0.0, 0.02, *rng.normal(size=4)])
     qpos[3:] /= np.linalg.norm(qpos[3:])
     data = mujoco.MjData(model)
@@ -53,10 +53,10 @@ def test_a_base_that_is_set_free_touches_as_the_file_says(tmp_path):
     """Shapes of a body that the file welds to the world have masks and friction, too, once floating= lets it move."""
     file = tmp_path / "base.xml"
     file.write_text(BASE)
-    found = {c.label: c.friction for c in spo.load(file, floating=True, contacts=True).contacts}
+    found = {c.label: c.friction for c in spo.load(file, floating=True, contacts="ground").contacts}
     assert found == {"sole": 0.3, "rod": 0.25}
     with pytest.warns(UserWarning, match="left out: box 'sole' of body 'base'"):
-        assert [c.label for c in spo.load(file, contacts=True).contacts] == ["rod"]
+        assert [c.label for c in spo.load(file, contacts="ground").contacts] == ["rod"]
 
 
 LOST = """<mujoco><asset><mesh name="hoof" file="nowhere.stl"/><texture type="2d" name="t" file="no.png"/></asset>
@@ -71,7 +71,7 @@ def test_a_mesh_that_is_missing_touches_nothing(tmp_path):
     file = tmp_path / "lost.xml"
     file.write_text(LOST)
     with pytest.warns(UserWarning, match=r"nowhere.stl.*; mesh that MuJoCo cannot read 'hoof' of body 'leg'"):
-        scene = spo.load(file, contacts=True)
+        scene = spo.load(file, contacts="ground")
     assert [(c.label, c.friction) for c in scene.contacts] == [("ball", 0.3)]
     with pytest.raises(spo.UnsupportedError, match=r"contacts='hoof', which matches mesh that MuJoCo cannot read"):
         spo.load(file, contacts="hoof")
@@ -103,9 +103,10 @@ def test_a_file_without_a_plane_has_no_floor(tmp_path):
     file = tmp_path / "pendulum.xml"
     file.write_text(PENDULUM)
     with pytest.warns(
-        UserWarning, match=r"left out: .*all contacts, because there is no plane .*ground=spo.Plane\(\) adds"
+        UserWarning,
+        match=r"left out: .*all contacts with a ground, because there is no plane .*ground=spo.Plane\(\) adds",
     ):
-        scene = spo.load(file, contacts=True)
+        scene = spo.load(file, contacts="ground")
     assert scene.ground is None and not scene.contacts
     model = mujoco.MjModel.from_xml_path(str(file))
     data, dyn, dt = mujoco.MjData(model), spo.Dynamics(scene, 1, dtype="float64"), 1e-3
@@ -117,7 +118,7 @@ def test_a_file_without_a_plane_has_no_floor(tmp_path):
         q, qd = dyn.step(q, qd, dt=dt, options=spo.StepOptions("rk4"))
     assert not data.ncon and abs(data.qvel[1]) > 0.5
     np.testing.assert_allclose(qd[0], data.qvel, rtol=1e-9)
-    assert {c.label for c in spo.load(file, contacts=True, ground=spo.Plane(-1.0)).contacts} == {"cart", "pole"}
+    assert {c.label for c in spo.load(file, contacts="ground", ground=spo.Plane(-1.0)).contacts} == {"cart", "pole"}
     assert spo.load(file, contacts="cart").ground.height == 0.0  # a pattern asks for a ground
 
 
@@ -151,7 +152,7 @@ def test_masks_pairs_and_excludes_choose_what_touches_in_mujoco(floor, contact, 
     file = tmp_path / "masked.xml"
     file.write_text(MASKED.format(floor=floor, contact=contact + exclude))
     wanted = mujocos_contacts(file).keys()
-    assert {c.label for c in spo.load(file, contacts=True).contacts} == wanted
+    assert {c.label for c in spo.load(file, contacts="ground").contacts} == wanted
 
 
 def test_friction_that_differs_across_is_said_to_be_left_out(tmp_path):
@@ -165,7 +166,7 @@ def test_friction_that_differs_across_is_said_to_be_left_out(tmp_path):
         )
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            (contact,) = spo.load(file, contacts=True).contacts
+            (contact,) = spo.load(file, contacts="ground").contacts
         assert contact.friction == 0.3
         assert [str(each.message).partition("left out: ")[2] for each in said] == left_out * [
             "the friction 0.9 across of a contact pair of geom 'ball', which has 0.3 in all directions"
@@ -189,7 +190,7 @@ def test_friction_is_mujocos(floor, tmp_path):
     """The larger of both, or that of higher priority, zero in contacts of one dimension; a pair has its own."""
     file = tmp_path / "rubbed.xml"
     file.write_text(RUBBED.format(floor=floor))
-    wanted, found = mujocos_contacts(file), {c.label: c.friction for c in spo.load(file, contacts=True).contacts}
+    wanted, found = mujocos_contacts(file), {c.label: c.friction for c in spo.load(file, contacts="ground").contacts}
     assert len(found) == 7 and len(set(found.values())) > 2
     assert found == pytest.approx(wanted)
 
@@ -216,7 +217,7 @@ def test_softness_that_is_not_mujocos_default_is_said_to_be_left_out(floor, more
         wanted[model.geom(contact.geom[1]).name] = ", ".join(changed)
     assert len(wanted) == 5 and set(wanted.values()) > {""}
     with pytest.warns(UserWarning) as said:
-        scene = spo.load(file, contacts=True)
+        scene = spo.load(file, contacts="ground")
     message = str(said[0].message)
     for text in set(wanted.values()) - {""}:
         names = [f"sphere '{c.label}' of body 'b'" for c in scene.contacts if wanted[c.label] == text]
@@ -230,4 +231,4 @@ def test_softness_that_is_not_mujocos_default_is_said_to_be_left_out(floor, more
         )
     )
     with pytest.warns(UserWarning, match="solref of sphere 'plain' of body 'b', sphere 'slow'"):
-        spo.load(file, contacts=True)
+        spo.load(file, contacts="ground")

@@ -343,7 +343,7 @@ def test_a_mesh_has_the_unit_of_its_file(unit, length, tmp_path):
     shape = '<collision><geometry><mesh filename="mesh.dae" scale="1 2 -1"/></geometry></collision>'
     file.write_text(f'<robot name="r"><link name="a">{shape}</link></robot>')
     with pytest.warns(UserWarning, match="a"):
-        scene = spo.load(file, floating=True, contacts=True)
+        scene = spo.load(file, floating=True, contacts="ground")
     wanted = length * np.array([[0, 0, 0], [1000, 0, 0], [0, 4000, 0], [0, 0, -3000]])
     np.testing.assert_allclose(sorted(scene.contacts[0].positions.tolist()), sorted(wanted.tolist()), rtol=1e-6)
     assert np.isclose(scene.bodies[0].mass, 1000.0 * 1e3 * 4e3 * 3e3 * length**3 / 6.0, rtol=1e-4)
@@ -357,4 +357,4 @@ def test_a_unit_that_is_none_is_named(tmp_path):
     mass = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
     file.write_text(f'<robot name="r"><link name="a">{mass}{shape}</link></robot>')
     with pytest.raises(ValueError, match=r"line 1, <mesh>: its file 'mesh.dae' .* has no unit of length"):
-        spo.load(file, floating=True, contacts=True)
+        spo.load(file, floating=True, contacts="ground")

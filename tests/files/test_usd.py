@@ -93,7 +93,7 @@ def test_units_are_converted(metre, kilogram, tmp_path):
 @pytest.mark.parametrize("metre", [1.0, 0.01])
 def test_contacts_are_in_metres(metre, tmp_path):
     """The pole is a cube of 10 cm; the cart has no collision shape; the file has no material."""
-    (contact,) = load(mover(tmp_path, metre), contacts=True).contacts
+    (contact,) = load(mover(tmp_path, metre), contacts="ground").contacts
     np.testing.assert_allclose(np.abs(contact.positions), 0.05, rtol=FLOAT32)
     assert contact.label.endswith("pole") and contact.body == 1
     assert contact.friction == np.float32(spo.Contact.friction)

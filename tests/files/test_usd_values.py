@@ -304,7 +304,7 @@ def test_attributes_of_contact_are_named_if_contacts_are_asked_for(tmp_path):
     """
     text = swing(body_more=ball)
     assert not loaded(tmp_path, text)[1]
-    scene, warning = loaded(tmp_path, text, contacts=True)
+    scene, warning = loaded(tmp_path, text, contacts="ground")
     assert scene.contacts and "mjc:solref (/World/arm/ball)" in warning
 
 

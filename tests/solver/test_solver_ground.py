@@ -34,7 +34,7 @@ def test_a_step_is_that_of_the_scene(device):
     """Bit by bit; worlds on height fields of their own, of which one is moved."""
     model = boxes(field(1), field(2, at=(0.3, 0.1, -0.02)), field(1))
     solver, state = SolverSPO(model), model.state()
-    scene = spo.from_newton(model, contacts=True)
+    scene = spo.from_newton(model, contacts="ground")
     assert scene.ground.count == 2 and scene.values["ground_field"].ravel().tolist() == [0, 1, 0]
     np.testing.assert_allclose(scene.values["ground_origin"], [[0, 0, 0], [0.3, 0.1, -0.02], [0, 0, 0]], atol=1e-7)
     variable = tuple(solver.dynamics.variable)

@@ -81,7 +81,7 @@ def test_a_solver_reads_elevations():
     """After a change and its announcement, by launches alone if they are variable, else with a warning."""
     for variable in ((ELEVATIONS,), ()):
         model = boxes(None, None, everywhere=field(1))
-        solver, scene = SolverSPO(model, variable=variable), spo.from_newton(model, contacts=True)
+        solver, scene = SolverSPO(model, variable=variable), spo.from_newton(model, contacts="ground")
         state, *_ = tilted(model, 2)
         end, mine = model.state(), spo.Dynamics(scene, 2, "cpu", variable=("ground_heights",) if variable else ())
         for more in (0.0, 0.2):
@@ -92,7 +92,7 @@ def test_a_solver_reads_elevations():
             else:
                 solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
             solver.step(state, end, None, None, H)
-            heights = spo.from_newton(model, contacts=True).values["ground_heights"][0]
+            heights = spo.from_newton(model, contacts="ground").values["ground_heights"][0]
             if variable:
                 mine.set(ground_heights=heights)
             else:

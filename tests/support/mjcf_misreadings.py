@@ -50,7 +50,7 @@ def loaded(file, **options):
 def misreadings(file, model):
     """Return in words where the scene of a file is not what MuJoCo has in ``model``, and what the warnings say."""
     scene, said = loaded(file)
-    touching, more = loaded(file, contacts=True)
+    touching, more = loaded(file, contacts="ground")
     rng = np.random.default_rng(0)
     both = Agreement(model, scene, WORLDS, granularity="node")
     both.dyn = DenseStates(scene)

@@ -100,6 +100,12 @@ def lacking(scene: Scene, variable: tuple[str, ...]) -> str:
     return lacks[0] if lacks else ""
 
 
+def why_few_pairs(scene: Scene) -> str:
+    """Return why steps of a scene take only few pairs, whose code is generated; "" if joint space takes many."""
+    lacks = lacking(scene, ())
+    return f"steps of a scene with {lacks} do not solve so many" if lacks else ""
+
+
 def motor_laws(scene: Scene, variable: tuple[str, ...]) -> tuple[int, ...]:
     """Return how many laws of its spring, drive and actuators each dof has that are computed with the bias force.
 

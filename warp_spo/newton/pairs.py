@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from ..errors import UnsupportedError
+from ..execution.joint_tables import why_few_pairs
 from ..kernels import declare
 from ..kernels import newton_contacts as kernels
 from ..scene.collision_shapes import ShapeSelection
@@ -80,29 +81,37 @@ def refuse_still(model: newton.Model, worlds: WorldRows, scene: Scene, named: fr
         )
 
 
-def select_pairs(call: str, shapes: ModelShapes, scene: Scene, takes_still: bool = False) -> PairSelection:
-    """Return what chooses pairs of a model's shapes, by its collision groups and filters."""
+def select_pairs(call: str, shapes: ModelShapes, scene: Scene, **options: Any) -> PairSelection:
+    """Return what chooses pairs of a model's shapes, by its collision groups and filters; ``options`` as of that."""
     first = shapes.first() if shapes.model.shape_count else []
     numbers = {shape.index: shape for shape in first}
-    return PairSelection(call, scene, first, shapes.touches, numbers, takes_still=takes_still)
+    return PairSelection(call, scene, first, shapes.touches, numbers, **options)
 
 
 def with_model_contacts(model: newton.Model, worlds: WorldRows, scene: Scene, selection: ShapeSelection) -> Scene:
     """Return the scene, with contacts of chosen shapes of a model if some are wanted; warn of what is left out."""
     shapes = functools.cache(lambda: ModelShapes(model, worlds))
-    between = functools.cache(lambda: select_pairs("from_newton", shapes(), scene, takes_still=True))
-    touching, lost = selection.body_pairs(between)
-    pairs, left_out = ModelPairs(shapes(), touching, between()) if touching else None, list[str]()
-    if selection.wants("from_newton"):
+    between = functools.cache(
+        lambda: select_pairs("from_newton", shapes(), scene, takes_still=True, why_few=why_few_pairs)
+    )
+
+    def touched(pairs: ModelPairs | None) -> tuple[Scene, list[str]]:
+        if not selection.wants("from_newton"):
+            return scene if pairs is None else pairs.added_to(scene), []
         made = model_contacts(model, worlds, scene, selection, without=frozenset() if pairs is None else pairs.still)
-        scene, left_out = made.scene, made.selected.left_out
+        return made.scene if pairs is None else pairs.added_to(made.scene), made.selected.left_out
+
+    touching, lost = selection.body_pairs(between)
+    found, left_out = touched(ModelPairs(shapes(), touching, between()) if touching else None)
+    if touching:
+        why = selection.refuse_many(between(), found, touching)
+        if why:
+            (found, left_out), lost = touched(None), between().missed(why)
+        else:
+            warn_of_overlaps("from_newton", found, len(found.contacts) - len(touching))
     if left_out + lost:
         warnings.warn(f"from_newton: left out: {', '.join(left_out + lost)}", UserWarning, stacklevel=3)
-    if pairs is None:
-        return scene
-    touching_scene = pairs.added_to(scene)
-    warn_of_overlaps("from_newton", touching_scene, len(scene.contacts))
-    return touching_scene
+    return found
 
 
 class ModelPairs:

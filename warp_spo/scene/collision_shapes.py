@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import fnmatch
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -42,8 +43,8 @@ MATERIAL_VALUES = (
     "stiffness and damping are chosen; scene.with_values(contact_stiffness=, contact_damping=) sets others"
 )
 NO_GROUND = (
-    "all contacts, because there is no plane and no height field to touch (ground=spo.Plane() adds a floor; a pattern, "
-    "such as contacts='*', takes the plane z = 0)"
+    "all contacts with a ground, because there is no plane and no height field to touch (ground=spo.Plane() adds a "
+    "floor; a pattern, such as contacts='*', takes the plane z = 0)"
 )
 MATERIAL = (*FRICTIONS, "stiffness", "damping")
 KINDS = tuple(kind for kind, shape in SHAPES.items() if shape.names)
@@ -140,7 +141,8 @@ class ShapeSelection(NamedTuple):
         ground: None: that of the source, or the plane at height zero; for all bodies a source that is ``complete`` has
             no ground but its own.
         points: of a hull at most.
-        pairs: of bodies that touch each other: "all", a list of names, or None, which is none and a word about it.
+        pairs: of bodies that touch each other: "all", or a list of names. None: all with contacts=True, if steps take
+            so many; none with "ground", and none and a word about it with patterns.
     """
 
     contacts: Any = None
@@ -174,21 +176,30 @@ class ShapeSelection(NamedTuple):
                 ground without contacts.
             UnsupportedError: a pattern matches a shape that no contact represents; or several grounds.
         """
-        try:
-            touching, left_out = self.body_pairs(pairs)
-            contacts, ground, grounded = [pair.contact() for pair in touching], None, self.wants(call)
-            if grounded:
-                paired = {pair.second.index for pair in touching}
-                moving = moving_bodies(scene)
+        between = None if pairs is None else functools.cache(pairs)
+
+        def touched(touching: list[ShapePair]) -> tuple[Scene, list[str]]:
+            contacts, ground, words = [pair.contact() for pair in touching], None, list[str]()
+            if self.wants(call):
+                paired, moving = {pair.second.index for pair in touching}, moving_bodies(scene)
                 seen = [one for one in shapes() if one.index not in paired or (one.body >= 0 and moving[one.body])]
                 found = self.resolve(call, scene, seen, touches, material_rule, complete)
                 contacts = [one for _, made in found.contacts_by_shape for one in made] + contacts
-                ground, left_out = found.ground, found.left_out + left_out
-            if not grounded and not contacts:
-                return scene, left_out
-            made = scene.with_contacts(contacts, ground)
-            warn_of_overlaps(call, made, len(contacts) - len(touching))
-            return made, left_out
+                ground, words = found.ground, found.left_out
+            elif not touching:
+                return scene, words
+            return scene.with_contacts(contacts, ground), words
+
+        try:
+            touching, lost = self.body_pairs(between)
+            made, words = touched(touching)
+            if touching and between is not None:
+                why = self.refuse_many(between(), made, touching)
+                if why:
+                    made, words = touched([])
+                    return made, words + between().missed(why)
+                warn_of_overlaps(call, made, len(made.contacts) - len(touching))
+            return made, words + lost
         except (ValueError, TypeError) as error:  # of a contact, which knows neither the call nor the file
             if not str(error).startswith(call):
                 error.args = (f"{call}: {error}",)
@@ -226,7 +237,22 @@ class ShapeSelection(NamedTuple):
         if pairs is None or unasked or (isinstance(self.pairs, list | tuple) and not self.pairs):
             return [], []
         selection = pairs()
-        return ([], selection.missed()) if self.pairs is None else selection.chosen(self.pairs)
+        return (
+            ([], selection.missed())
+            if self.pairs is None and self.contacts is not True
+            else selection.chosen(self.pairs)
+        )
+
+    def refuse_many(self, selection: PairSelection, made: Scene, pairs: list[ShapePair]) -> str:
+        """Return why no step takes a scene with so many pairs that nobody asked for; "" if one does, or for a list.
+
+        Raises:
+            UnsupportedError: the caller asked for all, and no step takes them.
+        """
+        why = selection.reason_against(made, pairs) if self.pairs is None or self._takes_all_pairs else ""
+        if why and self.pairs is not None:
+            selection.refuse_many(pairs, why)
+        return why
 
     def wants(self, call: str) -> bool:
         """Return whether contacts are wanted; ValueError for a ground without any, errors of patterns and points."""

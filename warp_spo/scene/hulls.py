@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from itertools import combinations
 from typing import NamedTuple
 
@@ -72,6 +73,21 @@ def convex_hull(call: str, points: np.ndarray, known: np.ndarray, most: int = MO
         ValueError: the points lie in a plane, or some are too near to each other to tell faces apart.
         UnsupportedError: there are more than MOST corners, or more than ``most`` faces.
     """
+    given = [np.ascontiguousarray(array, dtype=np.float64).tobytes() for array in (points, known)]
+    try:
+        return _remembered_hull(*given, most)
+    except (ValueError, UnsupportedError):
+        return _convex_hull(call, points, known, most)  # its error names the call
+
+
+@functools.lru_cache(maxsize=256)
+def _remembered_hull(points: bytes, known: bytes, most: int) -> tuple[Hull, np.ndarray]:
+    """Return :func:`convex_hull` of points as bytes: a shape has a hull in each of its pairs."""
+    return _convex_hull("", *(np.frombuffer(array).reshape(-1, 3) for array in (points, known)), most)
+
+
+def _convex_hull(call: str, points: np.ndarray, known: np.ndarray, most: int) -> tuple[Hull, np.ndarray]:
+    """Return the hull of points, and its middle, see :func:`convex_hull`."""
     middle, corners, normals, offsets = _corners_and_faces(call, points, known)
     size = float(np.ptp(points, axis=0).max())
     on = np.abs(corners @ normals.T - offsets) <= SAME * size
@@ -90,7 +106,7 @@ def convex_hull(call: str, points: np.ndarray, known: np.ndarray, most: int = MO
         read_only(corners[used]), tuple(tuple(number[i] for i in face) for face in faces),
         read_only(normals), read_only(offsets),
     )  # fmt: skip
-    return hull, middle
+    return hull, read_only(middle)
 
 
 def _corners_and_faces(

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from itertools import combinations, product
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from ..errors import UnsupportedError, as_integer
 from .collision_shapes import ALL, GROUNDS, CollisionShape
-from .contact_shapes import SHAPES, ContactShape
+from .contact_shapes import FACES, SHAPES, ContactShape
 from .contacts import FRICTIONS, Contact
 
 if TYPE_CHECKING:
@@ -85,6 +85,7 @@ class PairSelection:
         numbers: the shape of each number that a user may give.
         as_pair: returns two shapes with the material that the source gives to their contact.
         takes_still: whether "all" has shapes that stand still, too, but for grounds.
+        why_few: says of a scene with more than MOST pairs why steps take no more, "" if they do; None: they never do.
     """
 
     call: str
@@ -94,7 +95,9 @@ class PairSelection:
     numbers: dict[int, CollisionShape]
     as_pair: Callable[[CollisionShape, CollisionShape], ShapePair] = ShapePair
     takes_still: bool = False
+    why_few: Callable[[Scene], str] | None = None
     _pieces: list[int] = dataclasses.field(init=False)
+    _faces: dict[int, int] = dataclasses.field(default_factory=dict, init=False)
     _lacking: dict[int, str] = dataclasses.field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
@@ -139,19 +142,28 @@ class PairSelection:
         sides = (pair for one, other in combinations(trees.values(), 2) for pair in product(one, other))
         return next((ShapePair(*pair) for pair in sides if self.allowed(*pair)), None)
 
-    def missed(self) -> list[str]:
+    def reason_against(self, scene: Scene, pairs: Sequence[ShapePair]) -> str:
+        """Return why steps do not take a scene with so many pairs; "" if they do."""
+        return "" if len(pairs) <= MOST or self.why_few is None else self.why_few(scene)
+
+    def missed(self, why: str = "") -> list[str]:
         """Return in words that the scene has no contacts of bodies which may touch each other; nothing without any."""
         pairs = self._touching()
         if not pairs:
             return []
-        way = "pairs='all' takes them" if len(pairs) <= MOST else f"pairs=[...] takes up to {MOST} by names"
+        few = len(pairs) > MOST and (why or self.why_few is None or self.why_few(self.scene))
+        way = "pairs=[...] takes those that matter by names" if few else "pairs='all' takes them"
         such = ShapePair(*sorted(pairs[0], key=self.moves, reverse=True)).words(self.scene.body_labels)
         ways = f"{way}; contacts='ground' or pairs=[] says that there are none"
-        return [f"contacts between bodies: {len(pairs)} pair(s) of shapes, such as {such} ({ways})"]
+        because = f", because {why}" if why else ""
+        return [f"contacts between bodies: {len(pairs)} pair(s) of shapes, such as {such}{because} ({ways})"]
 
     def chosen(self, asked: Any) -> tuple[list[ShapePair], list[str]]:
-        """Return the pairs that ``asked`` stands for, and in words what is left out; errors as :meth:`resolve`."""
-        pairs, lost = self.resolve(asked)
+        """Return the pairs that ``asked`` stands for, and in words what is left out; errors as :meth:`resolve`.
+
+        None stands for all that the source lets touch; there may be none.
+        """
+        pairs, lost = self._representable() if asked is None else self.resolve(asked)
         words = [f"contacts of {len(lost)} pair(s) of shapes, such as {lost[0]} ({WAYS})"] if lost else []
         for unread in dict.fromkeys(pair.unread for pair in pairs if pair.unread):
             names = [pair.words(self.scene.body_labels) for pair in pairs if pair.unread == unread]
@@ -177,21 +189,30 @@ class PairSelection:
 
     def _all_pairs(self) -> tuple[list[ShapePair], list[str]]:
         """Return every pair that may touch, and in words those that no contact represents."""
-        pairs = self.candidates()
-        found = [pair for pair in pairs if self._stands(pair)]
+        found, lost = self._representable()
         if not found:
-            left_out = f"; {pairs[0].words(self.scene.body_labels)} is none that it can take" if pairs else ""
+            left_out = f"; {lost[0]} is none that it can take" if lost else ""
             raise ValueError(
                 f"{self.call}: pairs='all' finds no two shapes of bodies that move which may touch{left_out}; "
                 f"expected {', '.join(KINDS)}, and filters of the model that let them collide"
             )
-        if len(found) > MOST:
-            raise UnsupportedError(
-                self.call,
-                f"pairs='all' of {len(found)} pairs of shapes, more than {MOST}",
-                "list those that matter, such as pairs=[('cube', '*finger*')], or filter others in the model",
-            )
-        return found, [pair.words(self.scene.body_labels) for pair in pairs if not self._stands(pair)]
+        if self.why_few is None and len(found) > MOST:
+            self.refuse_many(found)
+        return found, lost
+
+    def refuse_many(self, pairs: Sequence[ShapePair], why: str = "") -> NoReturn:
+        """Raise UnsupportedError for more pairs than steps take."""
+        raise UnsupportedError(
+            self.call,
+            f"pairs='all' of {len(pairs)} pairs of shapes, more than {MOST}{f' ({why})' if why else ''}",
+            "list those that matter, such as pairs=[('cube', '*finger*')], or filter others in the model",
+        )
+
+    def _representable(self) -> tuple[list[ShapePair], list[str]]:
+        """Return every pair that may touch and that a contact represents, and the others in words."""
+        pairs = self.candidates()
+        lost = [pair.words(self.scene.body_labels) for pair in pairs if not self._stands(pair)]
+        return list(filter(self._stands, pairs)), lost
 
     def _named_pairs(self, names: Sequence[Any]) -> list[ShapePair]:
         """Return the pairs that two names stand for."""
@@ -213,7 +234,18 @@ class PairSelection:
 
     def _stands(self, pair: ShapePair) -> bool:
         """Whether a contact can stand for a pair."""
-        return pair.fits and not any(map(self._lacks, pair))
+        if not pair.fits or any(map(self._lacks, pair)):
+            return False
+        faces = [self._largest_face(shape) for shape in pair]
+        return 0 in faces or {shape.kind for shape in pair} == {"box"} or sum(faces) <= FACES
+
+    def _largest_face(self, shape: CollisionShape) -> int:
+        """Return how many corners the largest face of a shape has; 0 of a round one."""
+        if shape.index not in self._faces:
+            convex = shape.contact_shape().grown(0.0).convex(self.call) if shape.kind in ("box", "hull") else None
+            hull = None if convex is None else convex.hull
+            self._faces[shape.index] = 0 if convex is None else 4 if hull is None else max(map(len, hull.faces))
+        return self._faces[shape.index]
 
     def _lacks(self, shape: CollisionShape) -> str:
         """Return why no contact can have a shape of its kind; "" if one can."""

@@ -74,24 +74,27 @@ def load(
             MuJoCo refuses an MJCF file that has such. False keeps the file's numbers; where they make the mass matrix
             singular, results are NaN and ``status=`` says so.
         contacts: Which collision shapes touch the ground in :meth:`Dynamics.step`: None, none; "ground", those of all
-            bodies that can move, or none, with a warning, where an MJCF file's options disable contacts; True, the same
-            today; a pattern such as ``"*foot*"``, or a list of patterns, those whose name, or that of their body or
-            mesh, matches (``fnmatch``, in any case; a name also by what follows its last slash); or {pattern: points}.
-            ``["ground"]`` is a pattern. The scene's ``contacts`` hold the result. A sphere and the ends of a capsule
-            touch with their lowest point, a box with its corners. A mesh, a cylinder, a cone and an ellipsoid touch
-            with ``points`` of their surface. Friction is the file's: MuJoCo's of the two geoms, Bullet's
-            ``lateral_friction``, Gazebo's ``mu1``, a USD material's; 0.8 where a file has none. Torsional and rolling
-            friction are MuJoCo's with ``condim`` 4 and 6, and Bullet's ``spinning_friction`` and ``rolling_friction``.
+            bodies that can move, or none, with a warning, where an MJCF file's options disable contacts; True, these,
+            and pairs of bodies touch each other as the file says, see ``pairs``; a pattern such as ``"*foot*"``, or a
+            list of patterns, those whose name, or that of their body or mesh, matches (``fnmatch``, in any case; a name
+            also by what follows its last slash); or {pattern: points}. ``["ground"]`` is a pattern. The scene's
+            ``contacts`` hold the result. A sphere and the ends of a capsule touch with their lowest point, a box with
+            its corners. A mesh, a cylinder, a cone and an ellipsoid touch with ``points`` of their surface. Friction is
+            the file's: MuJoCo's of the two geoms, Bullet's ``lateral_friction``, Gazebo's ``mu1``, a USD material's;
+            0.8 where a file has none. Torsional and rolling friction are MuJoCo's with ``condim`` 4 and 6, and Bullet's
+            ``spinning_friction`` and ``rolling_friction``.
         ground: The ground that they touch. None: the file's plane or height field; without one, the plane at height
             zero, but no contacts for contacts="ground" of an MJCF file, which a warning says.
         points: Of a shape that is the hull of points, at most.
-        pairs: Which shapes of two bodies touch each other: "all" that the file lets touch, at most 32 pairs, those with
-            shapes that stand still, such as a table, included; or a list of pairs of names, patterns of shapes or
-            bodies, such as ``[("cube", "*finger*")]``; None or [], none. None with ``contacts`` other than "ground"
-            warns of how many are left out. An MJCF file lets geoms touch by MuJoCo's rules: masks, ``<pair>``,
-            ``<exclude>``, not those of a body and its parent; a URDF all but links next to each other, where links that
-            fixed joints connect are one; a USD file by its filters and collision groups. Each is one contact with
-            ``other``, see :class:`Contact`; boxes, spheres, capsules and convex meshes of up to 64 corners can touch.
+        pairs: Which shapes of two bodies touch each other: "all" that the file lets touch, those with shapes that stand
+            still, such as a table, included; or a list of pairs of names, patterns of shapes or bodies, such as
+            ``[("cube", "*finger*")]``; [], none. None: all with contacts=True, and none otherwise, of which patterns of
+            ``contacts`` warn. More than 32 need a scene that is solved in joint space, without actuators for example;
+            there contacts=True leaves them out, with a warning. An MJCF file lets geoms touch by MuJoCo's rules: masks,
+            ``<pair>``, ``<exclude>``, not those of a body and its parent; a URDF all but links next to each other,
+            where links that fixed joints connect are one; a USD file by its filters and collision groups. Each is one
+            contact with ``other``, see :class:`Contact`; boxes, spheres, capsules and convex meshes of up to 64 corners
+            can touch.
 
     Raises:
         FileNotFoundError: There is no such file.
