@@ -178,10 +178,13 @@ def robot_format(file: Path) -> str:
     """
     name = FORMATS.get(file.suffix.lower())
     if name is None:
-        end = f"ends in {quoted(file.suffix)}" if file.suffix else "has no suffix"
+        end, way_out = f"ends in {quoted(file.suffix)}", "export the robot in one of these formats"
+        if not file.suffix:
+            end, way_out = "has no suffix", "rename the file so that its suffix says its format"
+        elif file.suffix.lower() == ".xacro":
+            way_out = "expand it first: xacro robot.xacro > robot.urdf"
         raise ValueError(
-            f"load: {quoted(str(file), LONGEST_PATH)} {end}; expected one of {', '.join(FORMATS)}, which "
-            "says the format; rename the file"
+            f"load: {quoted(str(file), LONGEST_PATH)} {end}; expected one of {', '.join(FORMATS)}; {way_out}"
         )
     if not os.path.isfile(file):  # of a path that is too long, too
         home = ", where ~ is not replaced: pass Path(...).expanduser()" if str(file).startswith("~") else ""
