@@ -55,7 +55,7 @@ def test_an_arm_starts_from_its_keyframe(tmp_path):
     observed = env.get_observations()["actor"]  # lift, sine and cosine of turn, rates, actions
     assert observed.shape == (4, 1 + 2 + 2 + 2)
     torch.testing.assert_close(observed[:, 1:3], torch.stack([env.q[:, 0].sin(), env.q[:, 0].cos()], dim=1))
-    np.testing.assert_allclose(env.controls(torch.ones(4, 2))["ctrl"].cpu(), np.array([0.2, 0.4]) + 0.3, atol=1e-6)
+    np.testing.assert_allclose(env.controls(torch.ones(4, 2))["ctrl"].cpu(), [[0.5, 0.7]] * 4, atol=1e-6)
 
 
 @pytest.mark.parametrize(("robot", "words"), [
