@@ -99,6 +99,8 @@ def _without_gradient(dyn: Dynamics, arguments: dict[str, Any]) -> str:
         return "qdd is given; expected no qdd=, which the way back uses itself"
     if arguments.pop("actuator_state", None) is not None and actuators.delays_controls(dyn):
         return "actuators delay ctrl; expected a scene without delays, whose buffers have no gradients"
+    if arguments.get("rounds") and not dyn.scene.contacts:
+        return f"rounds is {arguments['rounds']} without contacts; expected rounds=None, which has gradients"
     for name in ("status", *integrators.BODIES, *contact_options.REPORTS):
         if arguments.get(name) is not None and arguments.get("substeps", 1) != 1:
             return f"{name} is given with substeps; expected one of the two"
@@ -209,8 +211,9 @@ def _step(
         buffers = actuators.read_state(self, call, actuator_state)
         states = _read_if_given(self, call, {"poses": poses, "velocities": velocities})
         reports = _read_if_given(self, call, report_arrays)
-        rounds_made = contact_options.check_rounds(self, call, rounds)
-        given |= {} if passes_made is None else {"passes": passes_made, "rounds": rounds_made, "reports": reports}
+        rounds_made = contact_options.check_rounds(self, call, integrator, rounds)
+        given |= {"rounds": rounds_made} if passes_made is not None or rounds_made else {}
+        given |= {} if passes_made is None else {"passes": passes_made, "reports": reports}
         given["bodies"] = integrators.arrays_of_bodies(self, states) if states else None
         q_out, qd_out = engine.write(call, STEP, outs, given)
         interval = StepArrays(given["q"], given["qd"], q_out, qd_out, given["dt"])
