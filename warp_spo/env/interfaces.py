@@ -96,7 +96,7 @@ def make_vector(env: Env, tensors: bool = False, autoreset_mode: Any = "SameStep
             if len(waiting) and given.shape == (env.num_envs, env.num_actions):
                 given = given.clone()
                 given[waiting] = (
-                    0.0  # which are taken back; others might fail, and leave files of steps that never were
+                    0.0  # their steps are taken back; other actions might fail, and leave files of failures
                 )
             observed, rewards, done, extras = env.step(given)
             ends, late = done.bool(), extras["time_outs"].bool()

@@ -289,7 +289,7 @@ class Tracing:
         later.forgets = True
         given, updated = w.kept[COMMAND], command_updated(self.commands, later, w.kept[COMMAND])
         later.starts = None
-        news = updated if intervals else [where(done, a, b) for a, b in zip(updated, given, strict=True)]
+        news = list(updated) if intervals else [where(done, a, b) for a, b in zip(updated, given, strict=True)]
         held, before = w.memory(HELD, len(given), reset=None), w.stored_memory(COMMAND)
         w.keep_own(COMMAND, [where(mark > 0.5, old, new) for mark, old, new in zip(held, before, news, strict=True)])
 
