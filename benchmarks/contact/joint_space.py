@@ -110,6 +110,17 @@ def settle(scene: spo.Scene, q: np.ndarray, target: np.ndarray, steps: int) -> t
     return state.numpy(), rates.numpy()
 
 
+class StepAtPoints(PairStep):
+    """A dense step whose pairs share the points that a solver has found, by number of the pair."""
+
+    def __init__(self, found: dict[int, list], *args: Any):
+        self.found = found
+        super().__init__(*args)
+
+    def points_of(self, number: int, first: Any, second: Any) -> list:
+        return self.found.get(number, [])
+
+
 class Case:
     """A scene with states of ``DIFFERENT`` worlds, and what a step does to them in float64 on the CPU."""
 
@@ -121,16 +132,18 @@ class Case:
         array = lambda x: wp.array(x, dtype=wp.float64, device="cpu")  # noqa: E731
         solver = JointSpaceStep(spo.Dynamics(self.scene, DIFFERENT, "cpu", "float64"), 24, 128)
         self.wanted = solver.step(array(q), array(qd), array(tau), (array(target), None), DT).numpy().copy()
+        near, touches = solver.near.numpy().reshape(DIFFERENT, -1), solver.touches.numpy().reshape(DIFFERENT, 24, 8, 7)
+        points = [{solver.tables.pairs[row[1 + k]]: [(x[:3], x[3:6], x[6]) for x in touches[w, k, : row[25 + k]]]
+                   for k in range(min(row[0], 24)) if row[1 + k] >= 0} for w, row in enumerate(near)]  # fmt: skip
         errors, closed = [], []
         for world in range(0, DIFFERENT, DIFFERENT // SAMPLE):
-            found = PairStep(self.scene, q[world], qd[world], DT, target[world]).run(tau[world], passes=4)[1]
+            dense = StepAtPoints(points[world], self.scene, q[world], qd[world], DT, target[world])
+            found = dense.run(tau[world], passes=4)[1]
             errors.append(np.abs(found.v - self.wanted[world]).max() / np.abs(found.v).max())
             closed.append(int(found.on.sum()))
-        near, touches = solver.near.numpy().reshape(DIFFERENT, -1), solver.touches.numpy().reshape(DIFFERENT, 24, 8, 7)
-        points = [(touches[w, k, : row[25 + k], 6] > -solver.margin).sum() for w, row in enumerate(near) for k in
-                  range(row[0])]  # fmt: skip
         self.contents = {
-            "near pairs": float(near[:, 0].mean()), "points": float(sum(points) / DIFFERENT),
+            "near pairs": float(near[:, 0].mean()),
+            "points": sum(len(own) for found in points for own in found.values()) / DIFFERENT,
             "closed": closed, "float64 against the dense step": float(max(errors)),
         }  # fmt: skip
 
@@ -159,8 +172,8 @@ class Run:
         solver.step(q, qd, tau, aim, DT, q_out=after)
         found = solver.qd_out.numpy()
         parts = {
-            "system": lambda _: solver.find_system(q, qd),
-            "points": lambda _: solver.find_points(),
+            "system": lambda _: solver.find_system(q, qd, DT),
+            "points": lambda _: solver.find_points(DT),
             "solve": lambda _: solver.solve(q, qd, tau, aim, DT),
             "step": lambda _: solver.step(q, qd, tau, aim, DT, q_out=after),
         }
