@@ -4,12 +4,14 @@
     python -m benchmarks.fuzz mjcf --minutes 10 --first 100000
     python -m benchmarks.fuzz usd --minutes 10                  # texts, .usda
     python -m benchmarks.fuzz mjcf --seed 812 --keep FOLDER     # one file again; it is written into the folder
+    python -m benchmarks.fuzz urdf --json benchmarks/results/files/FUZZ.json        # and a row in a file of results
 
 A seed chooses an installed file of the format, damages it in one to three places and chooses the options of the call. A
 file is read if no value of the scene is NaN, and refused if the error is a ValueError or FileNotFoundError that begins
 with the call, names the file and prints. Everything else is a finding, printed with its seed: another exception, a
 message that does not print, a value that is NaN, no answer within ``--seconds``, a process that ends. Files are
-read in a process of their own with ``MEMORY`` bytes at most. The command fails if there are findings.
+read in a process of their own with ``MEMORY`` bytes at most. The command fails if there are findings. ``--seconds`` are
+those of a clock: on a busy machine give more.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import argparse
 import collections
 import contextlib
 import importlib
+import json
 import multiprocessing
 import os
 import re
@@ -28,6 +31,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -303,11 +307,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seconds", type=float, default=20.0, help="time for one file")
     parser.add_argument("--seed", type=int, help="read the file of this seed alone")
     parser.add_argument("--keep", type=Path, help="write the files of findings, or that of --seed, into this folder")
+    parser.add_argument("--json", type=Path, help="file of results, which keeps the rows of other formats")
     given = parser.parse_args(arguments)
     kind, counts = FORMATS[given.format], collections.Counter[str]()
     seeds = until(time.monotonic() + 60.0 * given.minutes, given.first) if given.seed is None else [given.seed]
-    known = collections.Counter[str]()
+    known, findings = collections.Counter[str](), []
     for finding in search(kind, seeds, given.seconds, counts):
+        findings.append(finding)
         known[finding.place or finding.what[:60]] += 1
         if known[finding.place or finding.what[:60]] <= 3:  # of one kind
             print(f"seed {finding.seed}: {finding.what} {finding.place}".rstrip(), flush=True)
@@ -317,7 +323,21 @@ def main(arguments: list[str] | None = None) -> None:
     found = counts["files"] - counts["read"] - counts["refused"]
     print(f"{counts['files']} files: {counts['read']} read, {counts['refused']} refused, {found} findings of "
           f"{len(known)} kinds")  # fmt: skip
+    if given.json:
+        record(given.json, given.format, given.first if given.seed is None else given.seed, counts, findings)
     sys.exit(1 if found else 0)
+
+
+def record(path: Path, name: str, first: int, counts: dict[str, int], findings: list[Finding]) -> None:
+    """Write the row of a format into a file of results: its first seed, counts of files, and findings."""
+    rows = json.loads(path.read_text())["formats"] if path.exists() else {}
+    rows[name] = {
+        "first": first,
+        **{key: counts.get(key, 0) for key in ("files", "read", "refused")},
+        "findings": [finding._asdict() for finding in findings],
+    }
+    versions = {package: metadata.version(package) for package in ("mujoco", "newton", "usd-core")}
+    path.write_text(json.dumps({"versions": versions, "formats": rows}, indent=1) + "\n")
 
 
 def _keep(kind: Format, seed: int, folder: Path | None) -> None:

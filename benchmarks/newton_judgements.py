@@ -1,6 +1,6 @@
 """Judgements of Newton's solver tests that fail with SolverSPO in their solver's place: whose fault, and why."""
 
-NOT_OURS, OPEN = "not ours", "open"
+NOT_OURS = "not ours"
 IMPLICIT = "asserts the explicit Euler step; ours is implicit"
 JUDGEMENTS: list[tuple[str, str, str]] = [
     (
@@ -73,13 +73,6 @@ JUDGEMENTS: list[tuple[str, str, str]] = [
         r"test_penalty_friction_solver_step",
         NOT_OURS,
         "wants the deprecation warning of an option of SolverSemiImplicit",
-    ),
-    (
-        r"gjk_mpr_multicontact",
-        OPEN,
-        "spheres, a capsule and a cylinder lean against cubes; contacts between moving bodies of a caller's list are "
-        "left out, and the status is UNSUPPORTED, so they roll down the ramp; what lies on the ramp itself stays "
-        "within 0.3 mm once ke carries it, of 2e4 N/m under 970 kg",
     ),
 ]
 """(regular expression of the test, whose fault, why), the first that matches counts."""

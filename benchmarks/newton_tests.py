@@ -8,7 +8,8 @@ while a file of tests is read and run, without the options that only they have. 
 a solver; one that Newton runs with several solvers counts once, in the order of these names. The outcomes:
 
     passed      -
-    refused     an error says what SolverSPO does not do, such as UnsupportedError
+    refused     an error says what SolverSPO does not do, such as UnsupportedError; or the test fails beside a solver
+                whose status is UNSUPPORTED, the word for contacts that it leaves out
     internals   the test asks its solver for what only that solver has, such as MuJoCo's arrays
     failed      anything else; each has its judgement in ``newton_judgements``
     slow        it did not end within --seconds
@@ -87,17 +88,20 @@ class OutOfTime(BaseException):
     """A test took longer than its time; no test catches it, but unittest does."""
 
 
-def inject(made: list[str]) -> None:
-    """Put SolverSPO in the place of Newton's solvers; ``made`` gets the name of each that is constructed."""
+def inject(made: list[str], solvers: list[Any]) -> None:
+    """Put SolverSPO in the place of Newton's solvers.
+
+    ``made`` gets the name of each that a test constructs, ``solvers`` those that were not refused.
+    """
     import newton.solvers
 
     from warp_spo.newton import SolverSPO
 
     for name in SOLVERS:
-        setattr(newton.solvers, name, stand_in(name, getattr(newton.solvers, name), SolverSPO, made))
+        setattr(newton.solvers, name, stand_in(name, getattr(newton.solvers, name), SolverSPO, made, solvers))
 
 
-def stand_in(name: str, theirs: Any, base: Any, made: list[str]) -> Any:
+def stand_in(name: str, theirs: Any, base: Any, made: list[str], solvers: list[Any]) -> Any:
     """Return SolverSPO as a class of one of Newton's names, with the class's own helpers such as custom attributes."""
 
     from warp_spo.errors import UnsupportedError
@@ -111,11 +115,11 @@ def stand_in(name: str, theirs: Any, base: Any, made: list[str]) -> Any:
         options = {"contacts": "none" if disable_contacts else "auto"}
         try:
             base.__init__(self, model, **options)
-            return
         except (UnsupportedError, ValueError) as error:
             if "loops='" not in str(error):
                 raise
-        base.__init__(self, model, **options, loops="embed")  # a way out that the error names
+            base.__init__(self, model, **options, loops="embed")  # a way out that the error names
+        solvers.append(self)
 
     own = {"__init__": start, "register_custom_attributes": theirs.register_custom_attributes}
     return Helpers(name, (base,), own)
@@ -124,10 +128,11 @@ def stand_in(name: str, theirs: Any, base: Any, made: list[str]) -> Any:
 def run_file(file: str, match: str, seconds: int, optimized: bool) -> list[dict[str, Any]]:
     """Run the tests of a file whose names match, and return a row for each that made a solver."""
     made: list[str] = []
+    solvers: list[Any] = []
     wp.config.quiet = True
     if not optimized:
         compile_quickly()
-    inject(made)
+    inject(made, solvers)
     module = importlib.import_module(f"newton.tests.{file}")
     rows: list[dict[str, Any]] = []
     seen: set[str] = set()
@@ -138,13 +143,22 @@ def run_file(file: str, match: str, seconds: int, optimized: bool) -> list[dict[
         key = SUFFIX.sub("", name)
         if key in seen:
             continue
-        made.clear()
+        made.clear(), solvers.clear()
         outcome, why, spent = run_one(test, seconds)
+        if outcome == "failed" and any(map(leaves_out, solvers)):
+            outcome, why = "refused", f"status UNSUPPORTED, {why}"
         if made or outcome == "slow":
             seen.add(key)
             rows.append({"test": f"{file}.{key}", "in_place_of": sorted({*made}), "outcome": outcome, "why": why})
             print(f"{outcome:10} {file}.{key} {spent:.1f} s {why[:150]}", flush=True)
     return rows
+
+
+def leaves_out(solver: Any) -> bool:
+    """Whether the status of a world says that a solver left contacts out."""
+    from warp_spo import Status
+
+    return bool((solver.status.numpy() == Status.UNSUPPORTED).any())
 
 
 def order(name: str) -> int:

@@ -89,9 +89,37 @@ for (int number = 0;; ++number) {
             drive = most * w > effort ? effort / w : most;
             dof[DRIVE * N + i] = drive;
         }
-        if (done) continue;
         REAL resistance = FMA(h, value[C_STIFFNESS], value[C_DAMPING]) + drive;
         REAL force = FMA(drive, aim, dof[LOAD * N + i]);
+        LOOP
+        for (int l = LAWS ? table[T_LAW + own] : 0; l < (LAWS ? table[T_LAW + own + 1] : 0); ++l) {
+            const REAL* const law = motor + LAW * l;
+            const REAL line = FMA(-law[1], v - before, law[0]), least = law[2], most = law[3], scale = law[4];
+            const bool low = least > (REAL)-1e29, high = most < (REAL)1e29;
+            REAL part = scale, fixed = 0;
+            if (low && high) {
+                REAL beyond = 0;
+                if (!first) {
+                    const REAL bound = joint_space::positive(line > 0 ? most : -least);
+                    beyond = joint_space::positive(FMA(shares[l], joint_space::size_of(line), -bound));
+                    effort_excess = done && scale * beyond > effort_excess ? scale * beyond : effort_excess;
+                }
+                const REAL share = joint_space::share(law, line, scale * law[1] * (h * value[C_WEIGHT] * beyond));
+                shares[l] = share;
+                part = scale * share;
+                if (least > 0 || most < 0) {  // where the line pushes the other way, the bound acts as a force
+                    const bool outside = (line > 0 ? most : -least) < 0;
+                    fixed = outside ? scale * (line < least ? least : line > most ? most : line) : 0;
+                    part = outside ? 0 : part;
+                }
+            } else if ((low && line < least) || (high && line > most)) {
+                fixed = scale * (low ? least : most);
+                part = 0;
+            }
+            resistance = FMA(part, law[1], resistance);
+            force += FMA(part, FMA(law[1], before, law[0]), fixed);
+        }
+        if (done) continue;
         if (coordinate >= 0) force += value[C_STIFFNESS] * (value[C_REST] - at);
         if (value[C_DRY] > 0) {
             REAL w = joint_space::size_of(v);
@@ -329,6 +357,8 @@ EACH (i, N) {
 }
 LOOP
 EACH (i, PV * (PAIRS + SURFACES) + 1) wrong |= joint_space::lost(pair_value[i]) ? 2 : 0;
+LOOP
+EACH (i, LAW * LAWS) wrong |= joint_space::lost(motor[i]) ? 2 : 0;
 LOOP
 EACH (i, DV * DOFS) wrong |= joint_space::lost(dof_value[i]) ? 2 : 0;
 LOOP

@@ -59,15 +59,6 @@ struct joint_space
         return FMA(a[0], b[0], FMA(a[1], b[1], a[2] * b[2]));
     }
 
-    static CUDA_CALLABLE inline void turn(const REAL* pose, const REAL* x, REAL* y)
-    {
-        REAL t[3], u[3];
-        cross(pose + 3, x, t);
-        cross(pose + 3, t, u);
-        UNROLL
-        for (int c = 0; c < 3; ++c) y[c] = x[c] + 2 * FMA(pose[6], t[c], u[c]);
-    }
-
     // Adds what a point's force does to two dofs.
     static CUDA_CALLABLE inline void push(const REAL* J, const REAL* f, int apart, REAL* sum)
     {
@@ -91,6 +82,13 @@ struct joint_space
     }
 
     static CUDA_CALLABLE inline bool lost(REAL x) { return !(x - x == 0); }
+
+    // By which share a law's line, and ``more`` of its size that is expected, meets its bound.
+    static CUDA_CALLABLE inline REAL share(const REAL* law, REAL line, REAL more)
+    {
+        const REAL size = size_of(line) + more, bound = positive(line > 0 ? law[3] : -law[2]);
+        return bound < size ? bound / size : 1;
+    }
 
     // Adds a point's force in its axes to one in inertial axes.
     static CUDA_CALLABLE inline void add_force(const REAL* normal, const REAL* f, int apart, REAL* to)
@@ -129,7 +127,8 @@ alignas(64) char bytes[BYTES];
 #endif
 REAL* const s = (REAL*)bytes;
 Tile* const A = (Tile*)(s + AT_A);
-REAL *const J = s + AT_J, *const slot = s + AT_SLOT, *const dof = s + AT_DOF, *const held_mass = s + AT_M;
+REAL *const J = s + AT_J, *const slot = s + AT_SLOT, *const dof = s + AT_DOF, *const held_mass = s + AT_M,
+    *const shares = s + AT_SHARE;
 unsigned long long* const mask = (unsigned long long*)(bytes + AT_MASK);
 int *const run_start = (int*)(bytes + AT_RUN), *const run_couple = run_start + NEAR + SURFACES + 1;
 int *const slot_of = (int*)(bytes + AT_SLOT_OF), *const keep = (int*)(bytes + AT_KEEP);
@@ -141,6 +140,7 @@ const int* const table = place.data;
 const int* const nears = near.data + world * (1 + 2 * NEAR);
 const REAL* const touch = touches.data + world * (NEAR * MOST * POINT);
 const REAL* const surface = surfaces.data + world * surfaces.shape[1];
+const REAL* const motor = motors.data + world * motors.shape[1];
 const REAL* const dof_value = dof_values.data + (dof_values.shape[0] > 1 ? world : 0) * dof_values.shape[1];
 const REAL* const pair_value = pair_values.data + (pair_values.shape[0] > 1 ? world : 0) * pair_values.shape[1];
 const REAL half_gravity = pair_value[PV * (PAIRS + SURFACES)];
@@ -193,20 +193,8 @@ if (lane == 0) {
     run_start[runs] = slots;
     run_couple[NEAR + SURFACES] = runs;
 }
-// -- what dofs do: an axis, and a point on it, inertial; then velocities and loads
-EACH (i, DOFS) {
-    REAL* const to = s + AT_A + 6 * i;
-    const REAL* const value = dof_value + DV * i;
-    const int axis_body = table[T_AXIS_BODY + i], body = table[T_POINT_BODY + i];
-    const REAL* const pose = poses.data + (world * poses.shape[1] + body) * 7;
-    if (axis_body >= 0) {
-        joint_space::turn(poses.data + (world * poses.shape[1] + axis_body) * 7, value + C_AXIS_X, to);
-    } else {
-        for (int c = 0; c < 3; ++c) to[c] = value[C_AXIS_X + c];
-    }
-    joint_space::turn(pose, value + C_X, to + 3);
-    for (int c = 0; c < 3; ++c) to[3 + c] += pose[c];
-}
+// -- what dofs move; then velocities and loads
+EACH (i, SCREW * DOFS) s[AT_A + i] = screws.data[world * (SCREW * DOFS) + i];
 EACH (i, N) {
     const int own = table[T_DOF_OF + i];
     dof[V0 * N + i] = own < 0 ? 0 : qd.data[world * DOFS + own];
@@ -236,12 +224,11 @@ for (int item = lane; item < slots * MB; item += LANES) {
         const int sign = (row[1 + c] >> (8 + 2 * d) & 3) - 1, own = table[T_DOF_OF + 2 * block + d];
         REAL column[3] = {0, 0, 0};
         if (sign) {
-            const REAL *const axis = s + AT_A + 6 * own, *const value = dof_value + DV * own;
+            const REAL* const screw = s + AT_A + SCREW * own;
             REAL arm[3];
-            for (int r = 0; r < 3; ++r) arm[r] = point[r] - axis[3 + r];
-            joint_space::cross(axis, arm, column);
-            for (int r = 0; r < 3; ++r)
-                column[r] = sign * FMA(value[C_ANGULAR], column[r], value[C_LINEAR] * axis[r]);
+            for (int r = 0; r < 3; ++r) arm[r] = point[r] - screw[6 + r];
+            joint_space::cross(screw, arm, column);
+            for (int r = 0; r < 3; ++r) column[r] = sign * (column[r] + screw[3 + r]);
         }
         UNROLL
         for (int r = 0; r < 3; ++r) J[(at * MB + c) * 6 + 2 * r + d] = joint_space::dot(axes + 3 * r, column);

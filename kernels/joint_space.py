@@ -28,18 +28,22 @@ MOST, POINT = 8, 7  # points of a near pair; entries of a point: place, normal t
 SURFACE = 11
 """Entries of a surface of the ground at a point: place, normal, depth; push and damping of its law; gap; 1 where the
 point comes out slowly."""
+LAW = 5
+"""Entries of a law f(u) = scale clip(force - resistance u, least, most): force, resistance, least, most, scale."""
 DOF_FIELDS, SLOT_FIELDS = 12, 13
 DOF_VALUES = (
     "stiffness", "rest", "damping", "ke", "kd", "effort", "dry", "fastest", "brake", "weight",
-    "lower", "upper", "limit_ke", "limit_kd", "linear", "angular", "axis_x", "axis_y", "axis_z", "x", "y", "z",
+    "lower", "upper", "limit_ke", "limit_kd",
 )  # fmt: skip
-"""Constants of a dof; ``axis`` and ``x`` are in the axes of the bodies that the tables name."""
+"""Constants of a dof."""
+SCREW = 9
+"""Entries of what a dof moves: rate of turning and of moving, and the place that moves so, inertial axes."""
 PAIR_VALUES = ("stiffness", "damping", "friction", "eps", "weight")
 """Constants of a pair, and then of a surface at a point with the ground; after all of them, half of gravity."""
 NUMBERS = ("h", "passes", "most_force", "most_effort")
 ARGUMENTS = [
-    ("mass", 2), ("bias", 2), ("tau", 2), ("q", 2), ("qd", 2), ("target_q", 2), ("target_qd", 2), ("poses", 3),
-    ("near", 1), ("touches", 2), ("surfaces", 2), ("dof_values", 2), ("pair_values", 2), ("place", 1),
+    ("mass", 2), ("bias", 2), ("tau", 2), ("q", 2), ("qd", 2), ("target_q", 2), ("target_qd", 2), ("screws", 2),
+    ("near", 1), ("touches", 2), ("surfaces", 2), ("motors", 2), ("dof_values", 2), ("pair_values", 2), ("place", 1),
     *((name, 0) for name in NUMBERS),
     ("out", 2), ("qdd", 2), ("contact_f", 3), ("contact_gap", 2), ("contact_slip", 2), ("excess", 2), ("status", 1),
 ]  # fmt: skip
@@ -61,6 +65,7 @@ class Sizes(NamedTuple):
         columns: block columns of a couple at most. near: pairs at most that are near in a world. slots: points at most,
             those with the ground among them.
         surfaces, points: surfaces of the ground at points, each of which has a slot; points with the ground.
+        laws: of motors and of springs, beside those that follow from constants of a dof.
     """
 
     dofs: int
@@ -73,6 +78,7 @@ class Sizes(NamedTuple):
     slots: int
     surfaces: int = 0
     points: int = 0
+    laws: int = 0
 
     @property
     def words(self) -> int:
@@ -85,8 +91,8 @@ class Sizes(NamedTuple):
         sizes = {
             "DOF_OF": 2 * self.tiles, "ENTRY": self.entries, "MASK": 2 * self.tiles * self.words,
             "COUPLE": (1 + self.columns) * self.couples, "PAIR": 2 * (self.pairs + self.surfaces),
-            "AXIS_BODY": self.dofs, "POINT_BODY": self.dofs, "COORDINATE": self.dofs, "ROW_START": 2 * self.tiles + 1,
-            "ROW": 2 * self.entries - self.dofs,
+            "COORDINATE": self.dofs, "ROW_START": 2 * self.tiles + 1,
+            "ROW": 2 * self.entries - self.dofs, "LAW": self.dofs + 1,
         }  # fmt: skip
         starts, at = {}, 0
         for name, size in sizes.items():
@@ -99,8 +105,9 @@ def shared_layout(sizes: Sizes, T: type) -> tuple[dict[str, int], int]:
     b, real = sizes.tiles, 4 if T is wp.float32 else 8
     starts, at = {}, 0
     reals = {
-        "AT_A": max(4 * (b * (b + 1) // 2 + b), 6 * sizes.dofs, 5 * BLOCK), "AT_J": 6 * sizes.columns * sizes.slots,
+        "AT_A": max(4 * (b * (b + 1) // 2 + b), SCREW * sizes.dofs, 5 * BLOCK), "AT_J": 6 * sizes.columns * sizes.slots,
         "AT_SLOT": SLOT_FIELDS * sizes.slots, "AT_DOF": DOF_FIELDS * 2 * b, "AT_M": sizes.entries,
+        "AT_SHARE": sizes.laws,
     }  # fmt: skip
     for name, size in reals.items():
         starts[name], at = at, at + -(-size // 4) * 4
@@ -134,7 +141,7 @@ def solver(sizes: Sizes, T: type, lanes: int = 32, registers: int | None = None,
         "MB": sizes.columns, "NEAR": sizes.near, "S": sizes.slots, "BYTES": size, "MOST": MOST, "POINT": POINT,
         "DV": len(DOF_VALUES), "PV": len(PAIR_VALUES), "TILES": sizes.tiles * (sizes.tiles + 1) // 2 + sizes.tiles,
         "REFINE": refine, "SURFACE": SURFACE, "SURFACES": sizes.surfaces, "CONTACT_POINTS": sizes.points,
-        "WORDS": sizes.words,
+        "WORDS": sizes.words, "LAW": LAW, "LAWS": sizes.laws, "SCREW": SCREW,
     }  # fmt: skip
     constants |= WORDS | starts | {f"T_{name}": at for name, at in sizes.table_starts.items()}
     constants |= {f"C_{name.upper()}": i for i, name in enumerate(DOF_VALUES)}

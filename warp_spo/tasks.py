@@ -1,7 +1,8 @@
 """Tasks: ``python -m warp_spo.tasks`` lists them, ready ones and those of installed packages, with a line each.
 
     python -m warp_spo.tasks
-    python -m warp_spo.tasks --new my_task.py --like go2-flat     # a commented file to start from
+    python -m warp_spo.tasks --new my_task.py --robot my_robot.xml   # a file that trains a robot of yours, an MJCF
+    python -m warp_spo.tasks --new my_task.py --like go2-flat        # or begins as a ready task
 
 A package registers its tasks in its pyproject.toml, each a module with ``build`` and ``LEARNER``:
 
@@ -21,6 +22,7 @@ from pathlib import Path
 def main(arguments: list[str] | None = None) -> int:
     """List all tasks, or write a file to start from."""
     from .command_line import Parser
+    from .env.robot_tasks import robot_task
     from .env.task_files import find_registered, start_file
     from .env.tasks import TASKS
 
@@ -28,11 +30,15 @@ def main(arguments: list[str] | None = None) -> int:
         prog="python -m warp_spo.tasks", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--new", type=Path, help="file to write")
-    parser.add_argument("--like", default="cartpole", help="ready task that it begins as")
+    begins = parser.add_mutually_exclusive_group()
+    begins.add_argument("--like", default="cartpole", help="ready task that it begins as; left out: cartpole")
+    begins.add_argument("--robot", type=Path, metavar="FILE.xml", help="MJCF file of the robot that it is for")
     options = parser.parse_args(arguments)
+    if options.robot is not None and options.new is None:
+        parser.error("--robot without --new; expected --new FILE.py, the file to write")
     if options.new is not None:
         try:
-            text = start_file(options.like)
+            text = robot_task(options.new, options.robot) if options.robot else start_file(options.like)
             if options.new.suffix != ".py":
                 raise ValueError(f"--new {options.new}: expected a name that ends in .py")
             with options.new.open("x") as file:

@@ -128,7 +128,7 @@ def measure(name: str, worlds: int, device: wp.Device, passes: int | None = None
         errors.append(np.abs(after[world] - wanted).max() / np.abs(wanted).max())
     same = (after == np.resize(after[:DIFFERENT], after.shape)).all()
     return {"us": measure_time(step, device), "error": float(max(errors)), "repeated worlds equal": bool(same),
-            "kernel": dyn.programs.described()[0]}  # fmt: skip
+            "kernel": dyn.programs.describe()[0]}  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -190,7 +190,7 @@ def model_steps(solver: str) -> Callable[[str, int, float, wp.Device], Stepper]:
                 return f"iterations {option.iterations}, ls {option.ls_iterations}, {found:.1f} contacts a world"
             if contacts:
                 return f"{contacts.rigid_contact_count.numpy()[0] / worlds:.1f} contacts a world"
-            kernel = [x for x in taken.dynamics.programs.described() if x.startswith("contact_step")][-1]
+            kernel = [x for x in taken.dynamics.programs.describe() if x.startswith("contact_step")][-1]
             return f"{len(taken.dynamics.scene.contact_points)} points, {kernel}"
 
         arrays = [x for x in (states[0].joint_q, states[0].joint_qd, states[0].body_q, states[0].body_qd)]

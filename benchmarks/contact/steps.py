@@ -60,7 +60,7 @@ def prepare(
         dyn.step(q, qd, None, DT, options=options, report=report)
 
     def run() -> dict[str, Any]:
-        found: dict[str, Any] = {"us": measure_time(step, device), "kernel": dyn.programs.described()[0]}
+        found: dict[str, Any] = {"us": measure_time(step, device), "kernel": dyn.programs.describe()[0]}
         if force is None:
             return found
         after = dyn.step(q, qd, None, DT, options=options, report=report)[1].numpy()

@@ -1,6 +1,7 @@
 """benchmarks.fuzz: a short run of each format without findings, and planted faults, all of which it finds."""
 
 import collections
+import json
 
 import pytest
 
@@ -49,6 +50,24 @@ def test_a_seed_gives_the_same_file():
 
 def planted():
     return [f"{word} ".encode() * 30 for word in WORDS]
+
+
+def test_a_row_of_results_is_written_for_each_format(tmp_path, monkeypatch):
+    """A finding ends the command with 1; a run without any with 0, and rows of other formats stay."""
+    file, finding = tmp_path / "fuzz.json", fuzz.Finding(7, "KeyError", "load.py:3")
+    for name, found in (("urdf", [finding]), ("mjcf", [])):
+
+        def search(kind, seeds, seconds, counts, found=found):
+            counts.update(files=3, read=2, refused=1 - len(found))
+            return iter(found)
+
+        monkeypatch.setattr(fuzz, "search", search)
+        with pytest.raises(SystemExit) as ended:
+            fuzz.main([name, "--first", "5", "--json", str(file)])
+        assert ended.value.code == len(found)
+    rows = json.loads(file.read_text())["formats"]
+    assert rows["urdf"] == {"first": 5, "files": 3, "read": 2, "refused": 0, "findings": [finding._asdict()]}
+    assert rows["mjcf"] == {"first": 5, "files": 3, "read": 2, "refused": 1, "findings": []}
 
 
 @pytest.mark.slow

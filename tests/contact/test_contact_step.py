@@ -287,7 +287,7 @@ def test_a_quadruped_that_lands(device, dtype, granularity):
             over = (np.append(wanted.excess, lacking.max()) > 0.1 * np.array([weight, weight, 33.0, weight])).any()
             assert found["status"][w] == (spo.Status.CONTACT if over else spo.Status.OK)
     assert (found["status"] == spo.Status.CONTACT).any()  # of one pass
-    assert all(f"contact_step  {granularity}" in line for line in dyn.programs.described())
+    assert all(f"contact_step  {granularity}" in line for line in dyn.programs.describe())
 
 
 def test_what_starts_deep_comes_out_slowly(device):

@@ -10,6 +10,7 @@ import warp as wp
 
 import warp_spo as spo
 from support import pair_scenes
+from support.actuated import everything
 from support.hull_scenes import RAMP
 from support.pair_motions import momentum
 from support.pair_scenes import H, box, cube, cubes_in_a_row, free, hand, hand_states, mixed, mixed_states, shelf
@@ -50,7 +51,27 @@ def fingers(worlds=4):
     return hand(), q, qd, np.zeros_like(qd)
 
 
-CASES = {"pinch": pinch, "arms": arms, "fingers": fingers}
+def joints(worlds=4):
+    """A chain by hinges of several kinds, one with the rotor of its motor, that meets a cube and the ground."""
+    pose = (0.0, 0.0, -0.2, 0.0, 0.0, 0.0, 1.0)
+    kinds = [dict(kind="revolute", axis=(0, 1, 0), rotor=spo.Rotor(20.0, 2e-4)),
+             dict(kind="universal", axis=((1, 0, 0), (0, 1, 0))), dict(kind="helical", axis=(0, 0, 1), pitch=0.05),
+             dict(kind="ball")]  # fmt: skip
+    hinges = [spo.Hinge(one.pop("kind"), i - 1, i, parent_pose=pose, armature=0.01, damping=0.2, **one)
+              for i, one in enumerate(kinds)]  # fmt: skip
+    hinges.append(spo.Hinge("free", -1, 4))
+    bodies = [*(spo.Body(1.0, (0, 0, -0.1), 0.004 * np.eye(3)) for _ in range(4)), cube(0.7, 0.08)]
+    law, tip = dict(stiffness=1e4, damping=20.0), dict(sphere=((0.0, 0.0, -0.2), 0.05))
+    contacts = [spo.Contact(3, **tip), *(spo.Contact(i, **tip, other=box(4, 0.08), **law) for i in (1, 3))]
+    scene, rng = spo.Scene(bodies, hinges, contacts=contacts, ground=spo.Plane(height=-1.04)), np.random.default_rng(0)
+    q, qd = np.tile(scene.neutral_q, (worlds, 1)), 0.5 * rng.normal(size=(worlds, scene.dof_count))
+    q[:, :4] = 0.05 * rng.normal(size=(worlds, 4))
+    ends = spo.Dynamics(scene, worlds, "cpu", "float64").frame_poses(q, [(3, pose)])[:, 0, :3]
+    q[:, -7:-4] = ends + np.array([0.125, 0.0, 0.0])
+    return scene, q, qd, np.zeros_like(qd)
+
+
+CASES = {"pinch": pinch, "arms": arms, "fingers": fingers, "joints": joints}
 
 
 @functools.cache
@@ -113,7 +134,7 @@ def test_float32_is_refined(device):
     wanted = stepped(exact, q, qd, tau)[0]
     size = np.abs(wanted).max(axis=1, keepdims=True)
     assert (np.abs(v - wanted) < FLOAT32 * size).all()
-    for name in ("mass", "bias", "poses", "touches", "surfaces"):
+    for name in ("mass", "bias", "screws", "touches", "surfaces"):
         setattr(exact, name, wp.array(getattr(solver, name).numpy(), dtype=wp.float64, device=device))
     exact.near = solver.near
     given = [wp.array(x, dtype=wp.float64, device=device) for x in (q, qd, tau)]
@@ -245,6 +266,49 @@ def test_each_world_has_values_of_its_own(device):
         np.testing.assert_allclose(report.qdd[w], (wanted.v - qd[w]) / H, atol=1e3 * EXACT * np.abs(wanted.v).max())
 
 
+def pushed(spring):
+    """An arm with every kind of actuator and drives within effort limits, whose links touch balls that fly."""
+    arm = everything(
+        joint_effort_limit=np.array([6.0, 3.0, 1e6]), joint_target_ke=np.full(3, 20.0), joint_target_kd=np.full(3, 0.5)
+    )
+    count, ball = len(arm.bodies), dict(sphere=0.1)
+    hinges = [*arm.hinges, *(spo.Hinge("free", -1, count + i) for i in range(2)), spo.Hinge("ball", count, count + 2)]
+    bodies = [*arm.bodies, cube(1.0, 0.1), cube(2.0, 0.1), cube(0.5, 0.1)]
+    pairs = [(1, count), (2, count + 1), (count, count + 1), (count + 2, count + 1)]
+    law = dict(stiffness=1e4, damping=10.0)
+    contacts = [spo.Contact(a, **ball, other=spo.Contact(b, **ball), **law) for a, b in pairs]
+    scene = spo.Scene(bodies, hinges, contacts=contacts, actuators=arm.actuators)
+    stiff = scene.values["joint_stiffness"].copy()
+    stiff[:, -3:] = spring
+    values = {name: np.concatenate([arm.values[name], scene.values[name][:, arm.dof_count :]], axis=1)
+              for name in ("joint_effort_limit", "joint_target_ke", "joint_target_kd")}  # fmt: skip
+    return scene.with_values(**values, joint_stiffness=stiff)
+
+
+def test_motors_are_those_of_generated_code(device):
+    """Actuators with their ranges and curves, drives, their common limit, springs of a ball joint; spheres touch."""
+    scene, worlds, rng = pushed(30.0), 20, np.random.default_rng(2)
+    q, qd = np.tile(scene.neutral_q, (worlds, 1)), rng.normal(size=(worlds, scene.dof_count))
+    q[:, :3] = rng.normal(size=(worlds, 3))
+    one = spo.Dynamics(scene, worlds, device, "float64")
+    places = one.body_poses(q)
+    for free_body, near in ((len(scene.bodies) - 3, 1), (len(scene.bodies) - 2, 2)):
+        at = scene.q_start[scene.hinge_of[free_body]]
+        way = rng.normal(size=(worlds, 3))
+        q[:, at : at + 3] = places[:, near, :3] + 0.195 * way / np.linalg.norm(way, axis=1)[:, None]
+    ctrl, target = 4.0 * rng.normal(size=(worlds, len(scene.actuators))), q + 0.5 * rng.normal(size=q.shape)
+    target[:, -4:] = q[:, -4:]
+    other = spo.Dynamics(scene, worlds, device, "float64")
+    other._joint_space = choice.JointSpaceStep(other)
+    for given in ({}, dict(ctrl=ctrl), dict(ctrl=ctrl, target_q=target, target_qd=0.5 * qd)):
+        found = [pair_scenes.stepped(dyn, q, qd, **given) for dyn in (one, other)]
+        assert found[0]["contact_f"].any(axis=2).sum() >= worlds
+        scale = np.abs(found[0]["qd"]).max()
+        np.testing.assert_allclose(found[1]["qd"], found[0]["qd"], atol=EXACT * scale)
+        np.testing.assert_allclose(found[1]["contact_excess"], found[0]["contact_excess"], atol=EXACT * 1e3)
+        np.testing.assert_array_equal(found[1]["status"], found[0]["status"])
+
+
 def test_substeps_are_calls(device):
     """To the bit, with the mean force and the worst status."""
     dyn, q, qd = row_step(str(device), "float64")
@@ -330,10 +394,8 @@ def test_a_fast_ball_is_not_missed(device, speed):
 def test_what_it_does_not_take_has_words():
     """And such scenes keep generated code."""
     scene = grasp.scene()
-    hinges = [*scene.hinges[:-1], spo.Hinge("universal", -1, scene.hinge_of[-1], axis=((1, 0, 0), (0, 1, 0)))]
-    other = spo.Scene(scene.bodies, hinges, contacts=scene.contacts[1:])
-    assert lacking(other, ()) == "universal hinges"
-    assert lacking(scene, ("joint_X_p",)) == "joint_X_p that varies between worlds"
+    assert lacking(scene, ("joint_X_p", "contact_friction")) == ""
     flat = scene.with_contacts([spo.Contact(0, box=(0.1, 0.1, 0.0), other=box(1, 0.1))])
     assert lacking(flat, ()) == "boxes without thickness"
-    assert lacking(shelf(-1), ()) == "" and lacking(scene, ("contact_friction",)) == ""
+    turns = scene.with_contacts([spo.Contact(0, sphere=0.1, torsional_friction=0.1), *scene.contacts[1:]])
+    assert lacking(turns, ()) == "torsional friction" and lacking(shelf(-1), ()) == ""

@@ -5,8 +5,10 @@ import pytest
 import warp as wp
 
 import warp_spo as spo
-from support import contact_cases, symbolic, warp_machine
+from support import contact_cases, mechanisms, symbolic, warp_machine
 from support.contact_cases import quadruped, waisted
+from support.granularity_scenes import hand
+from support.step_scenes import furnished, states
 from warp_spo.dynamics.stepping import midpoint_contact
 from warp_spo.recursions.contact import step, velocity_kicks
 from warp_spo.recursions.contact.velocity_kicks import PASS_ACCELERATION, PATH, PREVIOUS_KICK, PREVIOUS_RATES
@@ -20,6 +22,7 @@ SMOOTH = 2e-4  # of rates at 2 rad/s after 5 ms [rad/s, m/s]; 3e-5 measured, thr
 SECOND_ORDER = 6.0  # by which half a step is better, of errors of third order; 7.9 measured
 RISE = 2e-4  # of energy in 1 s of flight at 3 rad/s; 1.1e-4 measured
 ROUNDING = 1e-12  # of the largest entry; 1e-14 measured
+LOADED = 1e-10  # the same where loads become hinge forces first, under links 100 times as heavy; 1e-13 measured
 
 
 def links(ratio):
@@ -89,10 +92,20 @@ def test_a_planted_bug_is_seen(bug, monkeypatch):
         test_what_a_light_base_carries_turns_as_it_should(1000.0)
 
 
-def test_one_round_keeps_the_energy_of_a_tree_in_flight():
+def limited(scene):
+    """The same with limits that its joints reach, and no contacts."""
+    ends = np.r_[np.full(6, 1e10), np.full(scene.dof_count - 6, 0.5)]
+    stiff = dict(joint_limit_lower=-ends, joint_limit_upper=ends, joint_limit_ke=1e3 * (ends < 1.0))
+    return scene.with_contacts([]).with_values(**stiff)
+
+
+@pytest.mark.parametrize("bounds", [lambda one: one, limited], ids=["contacts", "limits"])
+def test_one_round_keeps_the_energy_of_a_tree_in_flight(bounds):
     """Velocity terms at the start of the step give it energy in every step; with one round only of third order."""
-    scene = links(1.0).with_values(gravity=np.zeros(3))
+    scene = bounds(links(1.0).with_values(gravity=np.zeros(3)))
     dyn, a = spo.Dynamics(scene, WORLDS, "cpu", "float64", granularity="tree"), flying(scene, 3.0)
+    if not scene.contacts:
+        a["q"][:, 7:] *= 0.1
     start, rises = dyn.kinetic_energy(a["q"], a["qd"]), {}
     for rounds in (0, 1):
         q, qd, rises[rounds] = a["q"], a["qd"], 0.0
@@ -102,15 +115,64 @@ def test_one_round_keeps_the_energy_of_a_tree_in_flight():
     assert rises[1] <= RISE < 0.1 * rises[0]
 
 
+@pytest.mark.parametrize("rounds", [1, 2])
+def test_rounds_without_contacts_are_those_of_contacts_out_of_reach(rounds):
+    """With loads and accelerations, whatever the base carries; in place, too, where the last kick reads the state."""
+    scene = links(100.0)
+    a, found = flying(scene), []
+    rng = np.random.default_rng(5)
+    tau, body_f = 3.0 * rng.normal(size=a["qd"].shape), rng.normal(size=(WORLDS, 3, 6))
+    for one in (scene, scene.with_contacts([])):
+        dyn, options = spo.Dynamics(one, WORLDS, "cpu", "float64", granularity="tree"), spo.StepOptions(rounds=rounds)
+        qdd, status = np.full_like(a["qd"], np.nan), np.full(WORLDS, -1, np.int32)
+        q, qd = a["q"].copy(), a["qd"].copy()
+        more = dict(body_f=body_f, options=options, status=status, report=spo.StepReport(qdd=qdd))
+        dyn.step(q, qd, tau, H, out=(q, qd), **more)
+        np.testing.assert_allclose(a["qd"] + H * qdd, qd, atol=ROUNDING * abs(qd).max())
+        assert not status.any()
+        found.append(np.hstack([q, qd, H * qdd]))
+    np.testing.assert_allclose(found[1], found[0], atol=LOADED * abs(found[0]).max())
+
+
+@pytest.mark.slow
+def test_limbs_share_rounds_without_contacts(device):
+    """Springs, drives, limits and dry friction of a tree that limbs share, as a thread a world finds them."""
+    scene, found = furnished(hand()), []
+    a = states(scene, WORLDS, "float64")
+    for granularity in ("tree", "segment"):
+        dyn = spo.Dynamics(scene, WORLDS, device, "float64", granularity=granularity)
+        found.append(np.hstack(dyn.step(a["q"], a["qd"], a["tau"], H, options=spo.StepOptions(rounds=1))))
+    assert any("segment" in line for line in dyn.programs.described())
+    np.testing.assert_allclose(found[1], found[0], atol=1e-9)
+
+
+def test_the_only_kick_is_that_of_a_first_iteration():
+    """Of one round, whose kernel reads no rates of an iteration before; with the same bits."""
+    scene = links(10.0)
+    known = flying(scene) | {"dt": np.full((WORLDS, 1), H)}
+    first, found = {PREVIOUS_RATES: known["qd"], PREVIOUS_KICK: np.zeros_like(known["qd"])}, []
+    for given in (known, known | first):
+        stores = velocity_kicks.first_kick(Trace(Links(scene), "float64", tuple(given)))
+        read = lambda name, at, of=given: of[name][(slice(None), *at)]  # noqa: E731
+        found.append(evaluate([item.value for item in stores], read, "float64"))
+    np.testing.assert_array_equal(*found)
+
+
 def test_rounds_that_a_step_cannot_make_are_refused():
     scene = links(1.0)
-    dyn, a = spo.Dynamics(scene, WORLDS, "cpu", "float64"), flying(scene)
-    for rounds in (-1, 1.5):
-        with pytest.raises(ValueError, match=f"rounds is {rounds}; expected an integer, 0 or more"):
-            dyn.step(a["q"], a["qd"], None, H, options=spo.StepOptions(rounds=rounds))
-    dyn = spo.Dynamics(scene.with_contacts([]), WORLDS, "cpu", "float64")
-    with pytest.raises(ValueError, match="rounds is given, and the scene has no contacts"):
-        dyn.step(a["q"], a["qd"], None, H, options=spo.StepOptions(rounds=1))
+    a = flying(scene)
+    for one in (scene, scene.with_contacts([])):
+        dyn = spo.Dynamics(one, WORLDS, "cpu", "float64")
+        for rounds in (-1, 1.5):
+            with pytest.raises(ValueError, match=f"rounds is {rounds}; expected an integer, 0 or more"):
+                dyn.step(a["q"], a["qd"], None, H, options=spo.StepOptions(rounds=rounds))
+    for integrator in ("midpoint", "rk4"):
+        with pytest.raises(spo.UnsupportedError, match=f"rounds=1 with integrator='{integrator}'"):
+            dyn.step(a["q"], a["qd"], None, H, options=spo.StepOptions(integrator, rounds=1))
+    closed = mechanisms.geared()
+    dyn = spo.Dynamics(closed, 1, "cpu", "float64", loops="embed")
+    with pytest.raises(spo.UnsupportedError, match="rounds=1 where loops are closed"):
+        dyn.step(closed.neutral_q[None], np.zeros((1, closed.dof_count)), None, H, options=spo.StepOptions(rounds=1))
 
 
 @pytest.mark.slow
@@ -130,6 +192,9 @@ def test_gradients_of_one_round_are_differences(device):
         nudge[:, dof] = 1e-5
         wanted = (end(qd + nudge) - end(qd - nudge)) / 2e-5
         assert abs(given.grad[:, dof].sum() - wanted) <= 1e-7 * abs(given.grad).max()
+    dyn = spo.Dynamics(scene.with_contacts([]), WORLDS, device, "float64")
+    with pytest.raises(ValueError, match=r"rounds is 1 without contacts and .* expected rounds=None"):
+        end(given)
 
 
 @pytest.mark.slow

@@ -288,7 +288,7 @@ def test_several_operations_are_prepared_together(device):
     with no_warp_allocation():
         dyn.forward_dynamics(a["q"], a["qd"], a["tau"], a["body_f"], out=out[1])
         dyn.step(a["q"], a["qd"], a["tau"], 1e-3, options=spo.StepOptions(substeps=2), status=status, out=out)
-    assert len(dyn.programs.described()) == 3 and not status.numpy().any()
+    assert len(dyn.programs.describe()) == 3 and not status.numpy().any()
 
 
 @pytest.mark.parametrize("operation", OPERATIONS)

@@ -94,6 +94,20 @@ def test_a_world_that_nobody_resets_waits(mode):
         assert (rewards == 0.0).tolist() == [False, False, mode == "NextStep"]
 
 
+def test_actions_of_worlds_that_wait_leave_no_failure(tmp_path):
+    """Gymnasium drops them, so one that is not finite is neither counted nor kept; of a world that plays it is both."""
+    env = restless_env(3, keep_failures=tmp_path)
+    worlds = warp_spo.env.gymnasium(env, autoreset_mode="NextStep")
+    env.episode_length_buf = torch.tensor([0, 19, 19])
+    assert worlds.step(forces(0))[3].tolist() == [False, True, True]
+    spoilt = np.asarray(forces(1)).copy()
+    spoilt[1] = np.nan
+    worlds.step(spoilt)
+    assert not env.failure_files() and env.log()["/not finite/action"] == 0
+    worlds.step(spoilt)
+    assert [file.name for file in env.failure_files()] == ["world_00001_step_000002.pt"]
+
+
 def wrapped(mode, **more):
     return warp_spo.env.gymnasium(restless_env(3, **more), autoreset_mode=mode)
 

@@ -83,6 +83,17 @@ class Given(commands.Uniform):
         return self.ranges
 
 
+class Updated(commands.Uniform):
+    given = None
+
+    def update(self, w, command):
+        return self.given
+
+
+UPDATED = [Updated(((-1.0, 1.0),)) for _ in range(2)]
+object.__setattr__(UPDATED[1], "given", np.ones(3))
+
+
 class Setting(actions.Effort):
     def trace(self, w, action):
         return self.scale
@@ -125,6 +136,10 @@ RETURNED = [
     (dict(rewards={"up": (1.0, keeps(3, 1, 1.0))}), "World.memory: name is 3; expected a string"),
     (dict(rewards={"up": (1.0, lambda w: w.memory("m", 1, NAN)[0])}), "reset is nan; expected a finite number"),
     (dict(commands=Given(((1.0, 2.0),))), "commands.draw returned a tuple of 1; expected vectors by name"),
+    (dict(commands=UPDATED[0]), "Env: commands.update returned None; expected one number"),
+    (dict(commands=UPDATED[1]), r"Env: commands.update returned an array of shape \(3,\); expected one number"),
+    (dict(metrics={"m": returns(None)}), "Env: metric 'm' returned None; expected one number"),
+    (dict(events=[events.Start(keeps("m", 1, None))]), r"Env: World.keep\('m'\) was given None; expected one number"),
     (
         dict(actions=Setting(scale=[(7, 1.0)])),
         "actions.Setting.trace: an entry of tau is 7; expected an integer, 0 to 1",

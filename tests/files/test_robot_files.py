@@ -128,6 +128,12 @@ PATHS = {
     ),
     "a folder of a robot's name": ("c.urdf", ValueError, "'c.urdf' is a folder; .*; it holds none$"),
     "no suffix": ("robot", ValueError, "'robot' has no suffix; expected one of .urdf, .*; rename the file"),
+    "another format": (
+        "robot.sdf",
+        ValueError,
+        "'robot.sdf' ends in '.sdf'; expected one of .urdf, .*; export the robot",
+    ),
+    "xacro": ("robot.urdf.xacro", ValueError, "'robot.urdf.xacro' ends in '.xacro'; .* xacro robot.xacro > robot.urdf"),
     "a long path": (
         "x" * 5000 + ".xml",
         FileNotFoundError,

@@ -77,7 +77,7 @@ def test_forward_dynamics(name, dtype, granularity, device):
             dyn.forward_dynamics_vjp(*state, cotangent=on["y"], qdd=qdd, wrt=tuple(wanted), out=out)
             for key, value in wanted.items():
                 assert laws.error(out[key].numpy(), value) <= TOLERANCE[dtype], (key, body_f, qdd is None)
-    lines = [line for line in dyn.programs.described() if "forward_dynamics_vjp" in line]
+    lines = [line for line in dyn.programs.describe() if "forward_dynamics_vjp" in line]
     assert any("segment" in line for line in lines) == (granularity == "segment")
 
 

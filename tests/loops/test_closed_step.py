@@ -102,7 +102,7 @@ def released(dtype, device, worlds=3, **values):
     scene = MECHANISMS["fourbar"]().with_values(**values)
     dyn = spo.Dynamics(scene, worlds, device=device, dtype=dtype, loops="embed")
     crank = np.linspace(0.0, 3.0, worlds)
-    q = ClosureEvaluator(scene).closed(np.stack([crank, -1.0 - crank, np.full(worlds, 2.0)], axis=1))
+    q = ClosureEvaluator(scene).close(np.stack([crank, -1.0 - crank, np.full(worlds, 2.0)], axis=1))
     return dyn, [wp.array(x, dtype=dyn.dtype, device=device) for x in (q, np.zeros_like(q))]
 
 
@@ -221,7 +221,7 @@ def test_change_points_have_a_word(device):
 def crank_turning(closing, worlds=8, rate=10.0):
     """The four-bar in all its positions, its fastest bar turning at ``rate`` [rad/s]."""
     crank = np.linspace(0.0, 3.0, worlds)
-    q = closing.closed(np.stack([crank, -1.0 - crank, np.full(worlds, 2.0)], axis=1))
+    q = closing.close(np.stack([crank, -1.0 - crank, np.full(worlds, 2.0)], axis=1))
     qd = np.stack([np.linalg.svd(Y)[2][-1] for Y in closing.at(q)[1]])
     return q, qd * (rate / np.abs(qd).max(axis=1, keepdims=True))
 

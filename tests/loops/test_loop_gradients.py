@@ -142,7 +142,7 @@ def test_lagrange_along_what_closures_allow():
     v = s.qd
 
     def states(t):
-        q = closing.closed(s.q + t * v)
+        q = closing.close(s.q + t * v)
         return q, np.array([mechanisms.Closed(scene, x).consistent(rate) for x, rate in zip(q, s.qd, strict=True)])
 
     ends = {k: states(k * h) for way in FIRST for k in (way, -way)}
@@ -304,7 +304,7 @@ def test_float32_and_what_is_written(device):
 def test_a_singular_world_is_nan_alone(device):
     """A flat parallelogram, where it may fold: its closures lose a row; and a world with a NaN."""
     scene = MECHANISMS["parallelogram"]()
-    s = mechanisms.states(scene, 1, q=ClosureEvaluator(scene).closed(np.array([[0.5, -0.5, 0.5]])))
+    s = mechanisms.states(scene, 1, q=ClosureEvaluator(scene).close(np.array([[0.5, -0.5, 0.5]])))
     q = np.concatenate([s.q, np.zeros((1, 3)), s.q])
     qd, tau, y = (np.repeat(x, 3, 0) for x in (s.qd, s.tau, s.qdd))
     tau[2] = np.nan

@@ -10,7 +10,13 @@ from support import laws, mechanisms, zoo
 from support.closed_loops import AGREE, DIFFERENCES, both, by_embedding, by_multipliers, flat, lagrange, traced
 from support.mechanisms import MECHANISMS, Closed
 from support.quick import slow_unless
-from warp_spo.dynamics.loop_analysis import ClosureEvaluator, _generic_ranks, _spanning, drawn, embedding
+from warp_spo.dynamics.loop_analysis import (
+    ClosureEvaluator,
+    _choose_rows,
+    _generic_ranks,
+    draw_configurations,
+    embedding,
+)
 from warp_spo.examples.parts import at, bar
 from warp_spo.recursions.loops.embedded import Embedding
 from warp_spo.reference.dense import homogeneous, pose7
@@ -46,7 +52,7 @@ def test_dead_points_pass():
     closing = ClosureEvaluator(scene)
     crank = np.linspace(0.0, 2.0 * np.pi, 1000)
     start = np.stack([crank, -1.0 - crank, np.full(1000, 2.0)], axis=1)
-    q = closing.closed(start)
+    q = closing.close(start)
     Y = closing.at(q)[1][:, how.rows]
     X = np.linalg.svd(Y)[2][:, 2]
     worst = int(np.argmin(np.abs(X[:, 2])))
@@ -123,7 +129,7 @@ def test_near_parallel_loops(apart, dtype):
     ]
     scene = spo.Scene(scene.bodies, scene.hinges, loops=loops)
     closing = ClosureEvaluator(scene)
-    how = Embedding(tuple(_spanning(closing.at(q)[1], _generic_ranks(closing, q)[0])[0]), ())  # five of six
+    how = Embedding(tuple(_choose_rows(closing.at(q)[1], _generic_ranks(closing, q)[0])[0]), ())  # five of six
     s = mechanisms.States(q, *np.random.default_rng(0).normal(size=(3, 1, scene.dof_count)), np.zeros((1, 4, 6)))
     shapes = {"out": (scene.dof_count,), "margin": (len(how.rows),)}
     right = traced(scene, "embedded_forward_dynamics", s._asdict(), ("q", "tau"), shapes, embedding=how, status=True)
@@ -161,7 +167,7 @@ def test_a_locked_loop_stands_still():
     scene = spo.Scene([bar(0.5), bar(0.4)], hinges, loops=[loop])
     how = embedding(scene)
     assert how.dofs == () and len(how.rows) == 2
-    q = ClosureEvaluator(scene).closed(drawn(scene, 64))[:2]
+    q = ClosureEvaluator(scene).close(draw_configurations(scene, 64))[:2]
     s = mechanisms.States(q, *np.zeros((1, 2, 2)), *np.ones((2, 2, 2)), np.ones((2, 2, 6)))
     assert np.abs(by_embedding(scene, how, s)).max() == 0.0
     assert np.abs(by_multipliers(scene, s)).max() <= 1e-12
@@ -249,5 +255,5 @@ def test_loops_that_move_no_inertia_are_lost(device):
 def test_samples_stay_within_limits_far_from_zero():
     """Of a slider between 4 and 5 m, which no sample within 3.2 m of zero reaches."""
     hinge = spo.Hinge("prismatic", -1, 0, axis=(1, 0, 0), limit_lower=4.0, limit_upper=5.0)
-    q = drawn(spo.Scene([spo.Body(1.0, inertia=np.eye(3))], [hinge]), 64)
+    q = draw_configurations(spo.Scene([spo.Body(1.0, inertia=np.eye(3))], [hinge]), 64)
     assert (q[1::2] >= 4.0).all() and (q[1::2] <= 5.0).all()  # every other one is shrunk towards the neutral q

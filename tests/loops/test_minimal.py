@@ -105,7 +105,7 @@ def test_dead_points_pass():
     scene = MECHANISMS["fourbar"]()
     how, closing = embedding(scene, asked=[2]), ClosureEvaluator(scene)  # relative angle between coupler and rocker
     crank = np.linspace(0.0, 2.0 * np.pi, 1000)
-    q = closing.closed(np.stack([crank, -1.0 - crank, np.full(1000, 2.0)], axis=1))
+    q = closing.close(np.stack([crank, -1.0 - crank, np.full(1000, 2.0)], axis=1))
     X = np.linalg.svd(closing.at(q)[1][:, how.rows])[2][:, 2]
     worst = int(np.argmin(np.abs(X[:, 2])))
     assert np.abs(X[worst, 2]) < 1e-2

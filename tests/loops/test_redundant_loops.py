@@ -11,7 +11,7 @@ from support.closed_loops import DIFFERENCES, both
 from support.mechanisms import Closed
 from support.quick import slow_unless
 from support.redundant_loops import bennett, cranks, cranks_beside_a_door, door, folded, level, sarrus
-from warp_spo.dynamics.loop_analysis import ClosureEvaluator, drawn, embedding, usual_rank
+from warp_spo.dynamics.loop_analysis import ClosureEvaluator, draw_configurations, embedding, find_usual_rank
 
 FLOAT32 = 1e-5  # ten times what these mechanisms reach
 NEARLY = 1e-6  # [rad] by which states are off their closures
@@ -30,7 +30,7 @@ def state(name):
     """The scene, consistent states, three worlds, and Lagrange's accelerations."""
     scene, q, _ = LINKAGES[name]
     if q is None:
-        q = ClosureEvaluator(scene).closed(drawn(scene, 64))
+        q = ClosureEvaluator(scene).close(draw_configurations(scene, 64))
         q = q[np.argsort(-np.abs(np.sin(q)).min(axis=1))[:3]]  # far from flat
     rng, closed = np.random.default_rng(0), [Closed(scene, row) for row in q]
     qd = np.array([c.consistent(rng.normal(size=scene.dof_count)) for c in closed])
@@ -48,7 +48,7 @@ def state(name):
 def test_redundant_linkages_move_as_lagrange_says(name, dtype, device):
     """Both ways, with status OK, and nearly closed, too, where the rows that are redundant differ by a rounding."""
     scene, q, qd, tau, wanted = state(name)
-    assert usual_rank(scene) == len(embedding(scene).rows) == LINKAGES[name][2]
+    assert find_usual_rank(scene) == len(embedding(scene).rows) == LINKAGES[name][2]
     near = q + NEARLY * np.random.default_rng(1).normal(size=q.shape)
     for dyn in both(scene, 3, device, dtype):
         status = np.full(3, -1, dtype=np.int32)

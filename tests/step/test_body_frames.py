@@ -55,7 +55,7 @@ def test_equal_those_of_statements(name, variable, device):
     after = dyn.step(a["q"], a["qd"], a["tau"], H, **{n: a[n] for n in FORCES[1:]}, report=spo.StepReport(**bodies))
     for got, wanted in zip(bodies.values(), alone.body_states(*after), strict=True):
         np.testing.assert_allclose(got, wanted, rtol=0.0, atol=ROUNDING)
-    assert sum("body_states" in line for line in dyn.programs.described()) == 1
+    assert sum("body_states" in line for line in dyn.programs.describe()) == 1
 
 
 def test_warps_take_several_walks(monkeypatch, device):

@@ -146,11 +146,11 @@ def test_prepare_takes_options_and_names(case):
     given = dict(options=spo.StepOptions(passes=2), status=True)
     dyn.prepare("step", report=("contact_f", "poses"), **given)
     dyn.prepare("step", "body_poses", ("step", {"report": "qdd"}))
-    before = len(dyn.programs.described())
+    before = len(dyn.programs.describe())
     report = dyn.step_report("contact_f", "poses", like=q)
     dyn.step(q, qd, 0.0 * qd, H, options=given["options"], status=np.zeros(WORLDS, np.int32), report=report)
     dyn.step(q, qd, 0.0 * qd, H, report=dyn.step_report("qdd", like=q))
-    assert len(dyn.programs.described()) == before
+    assert len(dyn.programs.describe()) == before
     with pytest.raises(TypeError, match=r"Dynamics.prepare: passes= .*; expected options=StepOptions\(passes=...\)"):
         dyn.prepare("step", passes=2)
     with pytest.raises(TypeError, match=r'Dynamics.prepare: qdd= is no argument; expected report=\("qdd",\)'):

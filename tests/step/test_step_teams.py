@@ -73,7 +73,7 @@ def test_equals_the_dense_nonlinear_equation(name, dtype, device):
     step(dyn, on, status=status, qdd=qdd, out=(on["q"], on["qd"]))
     for over, array in zip((on["q"], on["qd"]), out, strict=True):
         np.testing.assert_array_equal(over.numpy(), array.numpy())
-    assert all("segment" in line for line in dyn.programs.described())
+    assert all("segment" in line for line in dyn.programs.describe())
 
 
 @pytest.mark.parametrize("integrator", ["semi_implicit", "midpoint"])
@@ -95,7 +95,7 @@ def test_equals_the_step_by_trees(integrator, device):
     for x, y in zip(*found, strict=True):
         np.testing.assert_allclose(y, x, rtol=0.0, atol=TOLERANCE["float64"])
     if integrator == "midpoint":
-        assert dyn.programs.described()[0].startswith("step  segment")
+        assert dyn.programs.describe()[0].startswith("step  segment")
 
 
 @pytest.mark.slow
@@ -123,7 +123,7 @@ def test_what_stays_a_thread_a_world(device):
     dyn = spo.Dynamics(short, 1, device=device, granularity="segment")
     a = states(short, 2, "float32")
     step(dyn, {name: array[:1] for name, array in a.items()})
-    assert "tree" in dyn.programs.described()[0]
+    assert "tree" in dyn.programs.describe()[0]
     assert by_segments(scene_of("fork")) and not by_segments(short)
 
 

@@ -68,7 +68,7 @@ def test_one_launch_takes_them_all(granularity, dtype, device):
     for count in (2, COUNT, COUNT):
         with record_launches() as launched:
             found = dyn.step(a["q"], a["qd"], a["tau"], H, **bundled(substeps=count, **given))
-    assert len(dyn.programs.described()) == 1 and len(launched) == 2  # the other one checks what the status is of
+    assert len(dyn.programs.describe()) == 1 and len(launched) == 2  # the other one checks what the status is of
     wanted, words = in_calls(dyn, a["q"], a["qd"], a["tau"], **(given | {"qdd": (last := np.full_like(qdd, np.nan))}))
     for x, y in zip((*found, qdd), (*wanted, last), strict=True):
         np.testing.assert_array_equal(x, y)

@@ -96,7 +96,7 @@ def gradient(scene, a, h, passes, cotangents, wrt, ran=None):
         scene.dof_count,
     )
     names = (*arguments, "dt", "passes", "number")
-    laws = contact_pass.count_laws(trace_of(scene, names))
+    laws = contact_pass.count_law_variables(trace_of(scene, names))
     count = contact_pass.count_variables(Links(scene, variable(scene)), laws)
     weighed = SIZES["P"] * len(contact_pass.weighed_segments(trace_of(scene, names)))
     back_names = (*names, "qdd", "solved", "q_cotangent", "qd_cotangent")

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 import warp_spo as spo
-from warp_spo.dynamics.loop_analysis import ClosureEvaluator, drawn, embedding
+from warp_spo.dynamics.loop_analysis import ClosureEvaluator, draw_configurations, embedding
 from warp_spo.examples.parts import at, bar
 from warp_spo.recursions.loops.embedded import Embedding
 from warp_spo.reference.dense import Dense, homogeneous, pose7, rotation_vector
@@ -273,7 +273,7 @@ def states(scene, worlds=3, seed=1, q=None):
     """States that differ from world to world, each closed: by the package, whose closure the reference checks."""
     rng = np.random.default_rng(seed)
     if q is None:
-        q = ClosureEvaluator(scene).closed(drawn(scene, 64, seed))
+        q = ClosureEvaluator(scene).close(draw_configurations(scene, 64, seed))
         q = q[rng.permutation(len(q))][:worlds]
     assert len(q) == worlds, "too few configurations could be closed"
     closed = [Closed(scene, x) for x in q]

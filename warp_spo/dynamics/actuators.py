@@ -149,8 +149,8 @@ def check_commands(dyn: Dynamics, call: Call, ctrl: Any, state: Any, target_q: A
         )
 
 
-def delayed(dyn: Dynamics, ctrl: wp.array, state: tuple[wp.array, wp.array]) -> wp.array:
-    """Launch one step of the delays, and return the controls that act in this step."""
+def advance_delays(dyn: Dynamics, ctrl: wp.array, state: tuple[wp.array, wp.array]) -> wp.array:
+    """Put ctrl [world, actuator] into the delay buffers ``state``, and return the controls that act in this step."""
     ring, count = state
     out = dyn.recursions.array("delayed controls", *ctrl.shape)
     field = dyn.recursions.parameters.field("actuator_delay")

@@ -372,15 +372,17 @@ def _builder(result: Any, arrays: list, results: list) -> Builder | None:
         return lambda arrays, results: None
     if isinstance(result, dict):
         names = tuple(result)
-        return _built_of(result.values(), lambda items: dict(zip(names, items, strict=True)), arrays, results)
+        return _container_builder(result.values(), lambda items: dict(zip(names, items, strict=True)), arrays, results)
     if isinstance(result, tuple):
         make: Any = tuple if type(result) is tuple else type(result)._make  # type: ignore[attr-defined]
-        return _built_of(result, make, arrays, results)
+        return _container_builder(result, make, arrays, results)
     return None
 
 
-def _built_of(items: Iterable[Any], make: Callable[[list], Any], arrays: list, results: list) -> Builder | None:
-    """Return a builder of a container."""
+def _container_builder(
+    items: Iterable[Any], make: Callable[[list], Any], arrays: list, results: list
+) -> Builder | None:
+    """Return a function that builds a container of ``items`` again; None where one of them cannot be."""
     builders = []
     for item in items:
         build = _builder(item, arrays, results)

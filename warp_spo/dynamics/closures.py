@@ -24,7 +24,7 @@ from ..recursions.loops import embedded, multipliers, projection
 from ..runtime import launches
 from ..runtime.arrays import Call
 from ..scene.scene import Scene
-from .loop_analysis import ClosureEvaluator, embedding, usual_rank
+from .loop_analysis import ClosureEvaluator, embedding, find_usual_rank
 
 if TYPE_CHECKING:
     from .dynamics import Dynamics
@@ -65,7 +65,7 @@ class Closures:
         if self.closed and loops == "multipliers" and scene.shares_dofs:
             what = "loops='multipliers' of a scene with flexible bodies or rotors"
             raise UnsupportedError("Dynamics", what, "use loops='embed'")
-        self._usual_rank = usual_rank(scene) if self.closed and loops == "multipliers" else 0
+        self._usual_rank = find_usual_rank(scene) if self.closed and loops == "multipliers" else 0
         self.embedding = embedding(scene, independent) if self.closed and loops == "embed" else None
         if self.closed:
             declare(kernels, dyn.dtype)

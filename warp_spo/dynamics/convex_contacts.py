@@ -78,10 +78,10 @@ def shape_rows(call: str, shapes: Sequence[PairShape]) -> ShapeRows:
     starts, loops = [0], list[int]()
     known: dict[int, int] = {}
     for number, shape in enumerate(shapes):
-        name, same = f"{call}: shape {number}", known.setdefault(id(shape), number)
-        if same < number:
-            rows.append(rows[same])
-            sizes[number], middles[number] = sizes[same], middles[same]
+        name, first_use = f"{call}: shape {number}", known.setdefault(id(shape), number)
+        if first_use < number:
+            rows.append(rows[first_use])
+            sizes[number], middles[number] = sizes[first_use], middles[first_use]
             continue
         if shape.kind not in KINDS:
             raise ValueError(f"{name} is a {shape.kind!r}; expected one of {', '.join(KINDS)}")
@@ -183,7 +183,7 @@ class ConvexContacts:
         call, count = "ConvexContacts", len(self.rows.rows)
         worlds = np.shape(poses)[0]
         given = checked_array(call, "poses", poses, (worlds, count, 7)).copy()
-        given[..., :3] += rotated(given[..., 3:], self.rows.middles)
+        given[..., :3] += rotate(given[..., 3:], self.rows.middles)
         pairs = np.broadcast_to(self.pairs, (worlds, *self.pairs.shape))
         near = self._upload(np.ascontiguousarray(pairs))
         places: wp.array = wp.array(given.ravel(), dtype=self.T, device=self.device)
@@ -203,7 +203,7 @@ class ConvexContacts:
         )
 
 
-def rotated(turn: np.ndarray, place: np.ndarray) -> np.ndarray:
+def rotate(turn: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Return places [..., 3] turned by quaternions xyzw [..., 4]."""
     axis, real = turn[..., :3], turn[..., 3:]
     twice = 2.0 * np.cross(axis, place)

@@ -53,7 +53,7 @@ from .call_replay import Replays
 from .closures import Closures, check_loops
 from .engine import Engine
 from .gradients import Gradients
-from .operation import Operation, declared
+from .operation import Operation, find_operations
 from .refinement import Refinement
 from .stepping import contact_options
 from .stepping import step as steps
@@ -323,7 +323,7 @@ class Dynamics:
         if self.plan.scan_reason:
             lines.insert(3, f"recursion    {plans.describe_recursion(self.plan)}")
         lines[3:3] = tuning.explain(self)
-        return "\n".join(lines + self.programs.described())
+        return "\n".join(lines + self.programs.describe())
 
     @property
     def operation_counts(self) -> dict[str, int]:
@@ -351,7 +351,7 @@ class Dynamics:
         return {}
 
 
-OPERATIONS = Dynamics._operations = declared(vars(Dynamics))
+OPERATIONS = Dynamics._operations = find_operations(vars(Dynamics))
 """The declared operations of Dynamics by name, in the order of the class."""
 
 

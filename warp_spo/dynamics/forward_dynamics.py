@@ -55,7 +55,7 @@ def _pull_forward_dynamics(
     return gradients.dyn.forward_dynamics_vjp(**given, cotangent=cotangent, qdd=qdd, wrt=wrt)
 
 
-AND_SOLVE = Routine(
+FORWARD_DYNAMICS_AND_SOLVE = Routine(
     "forward_dynamics_and_solve", recursion.forward_dynamics_and_solve, segments=SegmentForm(messages="Pzayb")
 )
 
@@ -176,7 +176,7 @@ def accelerations(dyn: Dynamics, out: wp.array, **given: Any) -> None:
 
 
 def known_accelerations(dyn: Dynamics, qdd: wp.array | None, **given: Any) -> wp.array | None:
-    """Return ``qdd``; where it is None, compute it by forward dynamics."""
+    """Return ``qdd`` [world, dof]; where it is None, compute it by forward dynamics. None for a scene without dofs."""
     if qdd is None and dyn.scene.dof_count:
         qdd = dyn.recursions.array("qdd of derivatives", dyn.worlds, dyn.scene.dof_count)
         accelerations(dyn, qdd, **given)
@@ -189,14 +189,14 @@ def _try_vjp(dyn: Dynamics, q: Any, qd: Any, tau: Any, b: Any, out: Any) -> None
     dyn.forward_dynamics_vjp(q, qd, tau, cotangent=b, wrt=("tangent", *others), out={"tangent": out, **others})
 
 
-_WAY_BACK = derivative_of(FORWARD_DYNAMICS)
+_DERIVATIVE = derivative_of(FORWARD_DYNAMICS)
 FORWARD_DYNAMICS_VJP = Operation(
     "forward_dynamics_vjp",
     arguments=(Q, QD, TAU, BODY_F, COTANGENT, KNOWN_QDD),
     results=(),
-    routine=_WAY_BACK.routine,
-    embed=_WAY_BACK.embed,
-    multipliers=_WAY_BACK.multipliers,
+    routine=_DERIVATIVE.routine,
+    embed=_DERIVATIVE.embed,
+    multipliers=_DERIVATIVE.multipliers,
     trial=Trial(
         lambda dense, q, qd, tau, b: forward_dynamics_by_q(dense, q, qd, tau).T @ b,
         call=_try_vjp,
@@ -254,18 +254,22 @@ def forward_dynamics_vjp(
     engine = self._engine
     with engine.call(FORWARD_DYNAMICS_VJP) as call:
         given = engine.read(call, FORWARD_DYNAMICS_VJP, q=q, qd=qd, tau=tau, body_f=body_f, cotangent=cotangent)
-        names, outs = self._gradients.outs(call, FORWARD_DYNAMICS, given, wrt, out)
+        names, outs = self._gradients.prepare_outputs(call, FORWARD_DYNAMICS, given, wrt, out)
         given |= engine.read(call, FORWARD_DYNAMICS_VJP, qdd=qdd)
         _launch_vjp(self, names, outs, given)
     return by_name(names, call.result)
 
 
 def _launch_vjp(dyn: Dynamics, names: tuple[str, ...], outs: Sequence[wp.array], given: dict[str, Any]) -> None:
-    """Launch one kernel; where a warp works on a limb, one for qdd and lambda and another for the recursion."""
-    derivative, launch = _WAY_BACK, dyn._gradients.launch
+    """Launch the gradients of forward dynamics into ``outs``, by one kernel or, at segment granularity, by two.
+
+    The first of two solves for lambda = Mass^-1 cotangent, which is the gradient by tau, and for qdd where it is not
+    given; the second goes back through inverse dynamics.
+    """
+    derivative, launch = _DERIVATIVE, dyn._gradients.launch
     qdd, cotangent = given["qdd"], given["cotangent"]
     state = {name: given[name] for name in ("q", "qd", "body_f")}
-    if dyn.embedding is not None:  # the closures bear what tau leaves, too
+    if dyn.embedding is not None:  # forces of the closures enter, and these depend on tau besides qdd
         arrays = {name: given[name] for name in ("q", "qd", "tau", "body_f")}
         qdd = known_accelerations(dyn, qdd, **state, tau=given["tau"])
         launch(derivative, names, outs, {**arrays, "qdd": qdd, "cotangent": cotangent})
@@ -281,7 +285,7 @@ def _launch_vjp(dyn: Dynamics, names: tuple[str, ...], outs: Sequence[wp.array],
     if qdd is None and results:
         qdd = dyn.recursions.array("qdd of derivatives", *shape)
         more = {"solved": solved}
-        dyn._engine.launch_routine(AND_SOLVE, qdd, more, **state, **forces, cotangent=cotangent)
+        dyn._engine.launch_routine(FORWARD_DYNAMICS_AND_SOLVE, qdd, more, **state, **forces, cotangent=cotangent)
     else:
         dyn._engine.launch(SOLVE_MASS_MATRIX, solved, q=given["q"], b=cotangent)
     if results:

@@ -157,7 +157,7 @@ class Gradients:
             arrays |= engine.read(call, operation, **options)
             if derivative.reads:
                 arrays[derivative.reads] = call.read("result", result, shape)
-            names, outs = self.outs(call, operation, {}, wrt, None)
+            names, outs = self.prepare_outputs(call, operation, {}, wrt, None)
             self.launch(derivative, names, outs, arrays)
         return by_name(names, call.result)
 
@@ -186,28 +186,31 @@ class Gradients:
                 parameters.refresh(values)
 
     # -- steps of the methods --------------------------------------------------------------------------------------
-    def outs(
+    def prepare_outputs(
         self, call: Call, operation: Operation, given: dict[str, Any], wrt: Sequence[str], out: dict[str, Any] | None
     ) -> tuple[tuple[str, ...], list[wp.array]]:
-        """Return the checked names of ``wrt``, and an array for the gradient by each.
+        """Check the names ``wrt`` by which a gradient is asked for; return them, and an array for the gradient by each.
+
+        Names are those of arguments, "tangent" for the first argument along its tangent coordinates, and values of the
+        scene that kernels read from memory. tau may be left out: its gradient does not read it.
 
         Args:
-            given: arguments by name, None where one was left out. out: the caller's arrays by name.
+            given: arguments by name, None where one was left out. out: the caller's arrays by name; others are made.
         """
         self.check_size(call)
         derivative = derivative_of(operation)
-        arguments, entering = derivative.by, derivative.values
+        arguments, scene_values = derivative.by, derivative.values
         names = as_names(call.name, "wrt", wrt, arguments[:2])
         if not isinstance(out, Mapping | None):
             raise TypeError(f"{call.name}: out is of type {type(out).__name__}; expected a dict, arrays by name of wrt")
         out = out or {}
-        known = (*arguments[:1], "tangent", *arguments[1:], *(name for name in entering if self._varies(name)))
+        accepted = (*arguments[:1], "tangent", *arguments[1:], *(name for name in scene_values if self._varies(name)))
         for name in names:
-            if name in entering and name not in known:
+            if name in scene_values and name not in accepted:
                 way = f"build Dynamics with variable=({name!r},)"
                 raise ValueError(f"{call.name}: wrt names {name!r}, which is folded into the kernels; {way}")
-            if name not in known:
-                raise ValueError(f"{call.name}: wrt names {name!r}; expected some of {', '.join(known)}")
+            if name not in accepted:
+                raise ValueError(f"{call.name}: wrt names {name!r}; expected some of {', '.join(accepted)}")
             if name in given and given[name] is None and name != "tau":
                 raise ValueError(f"{call.name}: wrt names {name!r}, which is None; pass zeros to differentiate by it")
         if not names or len(set(names)) < len(names):

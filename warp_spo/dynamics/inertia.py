@@ -160,12 +160,12 @@ def _solve_columns(dyn: Dynamics, q: wp.array, b: wp.array, out: wp.array) -> No
         launch(SOLVE_MASS_MATRIX, out, q=q, b=b, columns=columns)
         return
     for first in range(0, columns, COLUMNS):
-        turn = slice(first, min(first + COLUMNS, columns))
-        size = *b.shape[:2], turn.stop - turn.start
+        chunk = slice(first, min(first + COLUMNS, columns))
+        size = *b.shape[:2], chunk.stop - chunk.start
         right, x = (dyn.recursions.array((name, size), *size) for name in ("columns of b", "columns of Mass^-1 b"))
-        launches.copy(right, b[:, :, turn])
+        launches.copy(right, b[:, :, chunk])
         launch(SOLVE_MASS_MATRIX, x, q=q, b=right, columns=size[2])
-        launches.copy(out[:, :, turn], x)
+        launches.copy(out[:, :, chunk], x)
 
 
 def _solve_one_by_one(dyn: Dynamics, q: wp.array, b: wp.array, out: wp.array) -> None:

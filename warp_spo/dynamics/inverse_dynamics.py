@@ -193,7 +193,7 @@ def inverse_dynamics_vjp(
     engine = self._engine
     with engine.call(INVERSE_DYNAMICS_VJP) as call:
         given = engine.read(call, INVERSE_DYNAMICS_VJP, q=q, qd=qd, qdd=qdd, body_f=body_f, cotangent=cotangent)
-        names, outs = self._gradients.outs(call, INVERSE_DYNAMICS, given, wrt, out)
+        names, outs = self._gradients.prepare_outputs(call, INVERSE_DYNAMICS, given, wrt, out)
         self._gradients.launch(derivative_of(INVERSE_DYNAMICS), names, outs, given)
     return by_name(names, call.result)
 

@@ -72,8 +72,8 @@ class ClosureEvaluator:
         sizes = np.stack(np.broadcast_arrays(np.zeros(len(q)), *values), axis=1)[:, 1:]
         return np.sqrt(np.maximum(sizes, np.finfo(float).tiny))
 
-    def moved(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Return q [sample, coordinate] after a small step of the dofs [sample, dof]."""
+    def move(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Return a copy of q [sample, coordinate], moved by ``step`` [sample, dof] along its tangent coordinates."""
         arrays = {"q": q, "step": step}
         values = evaluate([value for _, value in self._moved], lambda name, index: arrays[name][:, index[0]])
         new = q.copy()
@@ -81,7 +81,7 @@ class ClosureEvaluator:
             new[:, coordinate] = value
         return new
 
-    def closed(self, q: np.ndarray) -> np.ndarray:
+    def close(self, q: np.ndarray) -> np.ndarray:
         """Move configurations [sample, coordinate] onto the closures, and return those for which this succeeded.
 
         Each sample takes STEPS steps of damped least squares (Levenberg-Marquardt): a step that makes |g| smaller is
@@ -92,7 +92,7 @@ class ClosureEvaluator:
         for _ in range(STEPS):
             damped = Y @ Y.transpose(0, 2, 1) + damping[:, None, None] * np.eye(self.size)
             step = -(Y.transpose(0, 2, 1) @ np.linalg.solve(damped, g[..., None]))[..., 0]
-            tried = self.moved(q, step)
+            tried = self.move(q, step)
             g_tried, Y_tried = self.at(tried)
             better = np.linalg.norm(g_tried, axis=1) < np.linalg.norm(g, axis=1)
             q, g = np.where(better[:, None], tried, q), np.where(better[:, None], g_tried, g)
@@ -101,7 +101,7 @@ class ClosureEvaluator:
         return q[np.abs(g).max(axis=1, initial=0.0) < CLOSED]
 
 
-def drawn(scene: Scene, count: int, seed: int = 0) -> np.ndarray:
+def draw_configurations(scene: Scene, count: int, seed: int = 0) -> np.ndarray:
     """Return random samples of the configuration [sample, coordinate], the same for equal arguments.
 
     Coordinates are uniform within their limits, no further than 3.2 from zero where the limits allow it, or in
@@ -128,13 +128,13 @@ def drawn(scene: Scene, count: int, seed: int = 0) -> np.ndarray:
     return q
 
 
-def usual_rank(scene: Scene) -> int:
-    """Return how many rows are independent where the loops close, other than at change points.
+def find_usual_rank(scene: Scene) -> int:
+    """Return how many rows are independent where the loops close, other than at change points (singular postures).
 
     The result is -1 if no closed configuration was found.
     """
     closing = ClosureEvaluator(scene)
-    q = closing.closed(drawn(scene, SAMPLES))
+    q = closing.close(draw_configurations(scene, SAMPLES))
     if len(q) == 0:
         return -1
     return sum(int(ranks.max()) for ranks in _generic_ranks(closing, q))
@@ -166,7 +166,7 @@ def _generic_ranks(closing: ClosureEvaluator, q: np.ndarray) -> list[np.ndarray]
 
 
 def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str = "Dynamics") -> Embedding:
-    """The rows that count, and the independent dofs: those ``asked`` for, or the first ones that move all others well.
+    """Return the rows that count and the independent dofs: those ``asked`` for, or the first that move all others well.
 
     Raises:
         ValueError: no configuration was found that closes all loops, or the dofs asked for do not move all others.
@@ -184,7 +184,7 @@ def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str 
                 f"embedding {len(cluster.dofs)} dof that move together ({tied}; up to {MOST_DOFS} are)",
                 "use loops='multipliers'",
             )
-    q = closing.closed(drawn(scene, SAMPLES))
+    q = closing.close(draw_configurations(scene, SAMPLES))
     if len(q) == 0:
         raise ValueError(
             f"{call}: no configuration was found that closes {scene.constraint_summary}; expected anchors that can "
@@ -195,13 +195,13 @@ def embedding(scene: Scene, asked: Sequence[int | str] | None = None, call: str 
     free = set(range(scene.dof_count))
     for cluster, ranks in zip(clusters, _generic_ranks(closing, q), strict=True):
         numbers, dofs = np.array(cluster.rows, dtype=int), np.array(cluster.dofs, dtype=int)
-        kept, X = _spanning(Y[:, numbers][:, :, dofs], ranks)
+        kept, X = _choose_rows(Y[:, numbers][:, :, dofs], ranks)
         rows += numbers[kept].tolist()
         if wanted is None:
-            independent = _independent(X)
+            independent = _choose_independent(X)
         else:
             independent = [i for i, dof in enumerate(dofs.tolist()) if dof in wanted]
-            if len(independent) != X.shape[2] or not (_hold(X, independent) > RANK).any():
+            if len(independent) != X.shape[2] or not (_rate_dofs(X, independent) > RANK).any():
                 labels = [scene.dof_labels[dof] for dof in dofs]
                 still = [label for label, size in zip(labels, _mobility(X), strict=True) if size == 0.0]
                 raise ValueError(
@@ -231,10 +231,10 @@ def _numbers(scene: Scene, asked: Sequence[int | str], call: str) -> set[int]:
     return found
 
 
-def _spanning(Y: np.ndarray, ranks: np.ndarray) -> tuple[list[int], np.ndarray]:
-    """Rows that span all of them, of Y [draw, row, column] of ``ranks`` [draw], where those are largest.
+def _choose_rows(Y: np.ndarray, ranks: np.ndarray) -> tuple[list[int], np.ndarray]:
+    """Return rows that span all of them, of Y [draw, row, column] of ``ranks`` [draw], where those are largest.
 
-    Return with them orthonormal X [draw, column, free] with Y X = 0.
+    With them come orthonormal X [draw, column, free] with Y X = 0.
     """
     rank = int(ranks.max(initial=0))
     if rank == 0:
@@ -246,7 +246,7 @@ def _spanning(Y: np.ndarray, ranks: np.ndarray) -> tuple[list[int], np.ndarray]:
     return rows, np.linalg.svd(Y[:, rows])[2][:, rank:].transpose(0, 2, 1)
 
 
-def _hold(X: np.ndarray, dofs: list[int]) -> np.ndarray:
+def _rate_dofs(X: np.ndarray, dofs: list[int]) -> np.ndarray:
     """Return how well some dofs determine the others [draw]: 0 where they do not. Units of dofs do not matter."""
     if not dofs:
         return np.ones(len(X))
@@ -262,10 +262,10 @@ def _mobility(X: np.ndarray) -> np.ndarray:
     return np.where(size > RANK * size.max(initial=0.0), size, 0.0)
 
 
-def _independent(X: np.ndarray) -> list[int]:
+def _choose_independent(X: np.ndarray) -> list[int]:
     """Return the first dofs that determine the others nearly as well as any, in the worst tenth of the draws."""
     count = X.shape[2]
-    measure = lambda dofs: float(np.quantile(_hold(X, list(dofs)), WORST))  # noqa: E731
+    measure = lambda dofs: float(np.quantile(_rate_dofs(X, list(dofs)), WORST))  # noqa: E731
     subsets = {tuple(_pivots(x, count)) for x in X}
     for least in (0.3, 0.1, 0.03):
         greedy: list[int] = []
@@ -279,7 +279,7 @@ def _independent(X: np.ndarray) -> list[int]:
 
 
 def _pivots(A: np.ndarray, count: int) -> list[int]:
-    """Rows of A that span the most: each the longest beyond those before it, the first of equals."""
+    """Return the rows of A that span the most: each the longest beyond those before it, the first of equals."""
     left, found = A.copy(), []
     for _ in range(count):
         lengths = np.linalg.norm(left, axis=1)

@@ -490,7 +490,7 @@ def derivative_of(operation: Operation) -> Derivative:
     return operation.derivative
 
 
-def declared(methods: Mapping[str, Any]) -> dict[str, Operation]:
+def find_operations(methods: Mapping[str, Any]) -> dict[str, Operation]:
     """Return the operations among the members of a class by name, in their order."""
     found = [vars(member).get("operation") for member in methods.values() if inspect.isfunction(member)]
     return {operation.name: operation for operation in found if isinstance(operation, Operation)}

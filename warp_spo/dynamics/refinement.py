@@ -44,9 +44,9 @@ class Refinement:
     def forward_dynamics(self, q: wp.array, qd: Any, tau: Any, body_f: Any, status: Any, out: wp.array) -> None:
         """out = Mass^-1 (tau - bias_force); the status words are those of the float32 solution."""
         narrow = self.narrow
-        low, high = ({name: self._in(dyn, name, x) for name, x in (("q", q), ("qd", qd), ("body_f", body_f))}
+        low, high = ({name: self._convert(dyn, name, x) for name, x in (("q", q), ("qd", qd), ("body_f", body_f))}
                      for dyn in (narrow, self.wide))  # fmt: skip
-        right, x = self._in(narrow, "tau", tau), self._array(narrow, "x")
+        right, x = self._convert(narrow, "tau", tau), self._array(narrow, "x")
         swept = narrow._engine.launch(FORWARD_DYNAMICS, x, tau=right, **low)
         if status is not None:
             found = low["q"], low["qd"], right, low["body_f"], x, status
@@ -63,9 +63,9 @@ class Refinement:
                 self.solve_mass_matrix(q, column, found)
                 launches.copy(out[:, :, j], found)
             return
-        low, x = self._in(self.narrow, "q", q), self._array(self.narrow, "x")
-        self.narrow._engine.launch(SOLVE_MASS_MATRIX, x, q=low, b=self._in(self.narrow, "b", b))
-        self._refine(low, x, b, out, q=self._in(self.wide, "q", q), gravity=False)
+        low, x = self._convert(self.narrow, "q", q), self._array(self.narrow, "x")
+        self.narrow._engine.launch(SOLVE_MASS_MATRIX, x, q=low, b=self._convert(self.narrow, "b", b))
+        self._refine(low, x, b, out, q=self._convert(self.wide, "q", q), gravity=False)
 
     def _refine(self, at: wp.array, x: wp.array, right: Any, out: wp.array, **given: Any) -> None:
         """out = x + corrections; ``at`` is q in float32, ``given`` what float64's inverse dynamics takes."""
@@ -81,8 +81,8 @@ class Refinement:
         if total is not out:
             self._launch(kernels.cast(wp.float64, wp.float32), [total], out)
 
-    def _in(self, dyn: Dynamics, name: str, x: Any) -> Any:
-        """``x`` in the precision of ``dyn``."""
+    def _convert(self, dyn: Dynamics, name: str, x: Any) -> Any:
+        """Return ``x`` in the precision of ``dyn``: itself, or a scratch array."""
         if x is None or x.dtype is dyn.dtype:
             return x
         other = dyn.recursions.array(f"refined {name}", *x.shape)

@@ -145,14 +145,14 @@ def _routine(dyn: Dynamics, operation: Operation) -> Routine:
 def use(dyn: Dynamics, name: str, choice: Tuned) -> None:
     """Let the routine of this name, or the sweeps, run by a choice from now on."""
     if name == RECURSION:
-        _switch_recursion(dyn, dyn.plan.block_lengths(dyn.scene)[choice.granularity])
+        _set_block_length(dyn, dyn.plan.block_lengths(dyn.scene)[choice.granularity])
     else:
-        _switch(dyn, name, choice.granularity)
+        _set_granularity(dyn, name, choice.granularity)
     dyn.plan.tuned[name] = choice
 
 
-def _switch(dyn: Dynamics, name: str, granularity: str | None) -> None:
-    """Let the routine of this name run as if a granularity were asked for; None, or that of the rules: by the rules."""
+def _set_granularity(dyn: Dynamics, name: str, granularity: str | None) -> None:
+    """Let the routine of this name, and the one that it runs first, use a granularity; None: that of the rules."""
     plan = dyn.plan
     every = [one.routine for one in dyn._operations.values() if one.routine is not None]
     every += [one.touching(dyn) for one in dyn._operations.values() if one.touching is not None]
@@ -167,7 +167,7 @@ def _switch(dyn: Dynamics, name: str, granularity: str | None) -> None:
     dyn._gradients.forget()
 
 
-def _switch_recursion(dyn: Dynamics, block_length: int) -> None:
+def _set_block_length(dyn: Dynamics, block_length: int) -> None:
     """Let sweeps run as if the plan had this block length."""
     dyn.recursions.use_block_length(block_length)
     dyn._replays.forget()
@@ -199,11 +199,11 @@ def _measure(dyn: Dynamics, operation: Operation, routine: Routine, candidates: 
     us, out = {}, None
     try:
         for granularity in candidates:
-            _switch(dyn, routine.name, granularity)
+            _set_granularity(dyn, routine.name, granularity)
             out = operation.entry(dyn, **given) if out is None else out
             us[granularity] = 1e6 * _seconds(functools.partial(operation.entry, dyn, **given, out=out), dyn.device)
     finally:
-        _switch(dyn, routine.name, None)
+        _set_granularity(dyn, routine.name, None)
     return us
 
 
@@ -213,10 +213,10 @@ def _measure_recursion(dyn: Dynamics, operation: Operation) -> dict[str, float]:
     out = operation.entry(dyn, **given)
     try:
         for name, block_length in dyn.plan.block_lengths(dyn.scene).items():
-            _switch_recursion(dyn, block_length)
+            _set_block_length(dyn, block_length)
             us[name] = 1e6 * _seconds(functools.partial(operation.entry, dyn, **given, out=out), dyn.device)
     finally:
-        _switch_recursion(dyn, dyn.plan.block_length)
+        _set_block_length(dyn, dyn.plan.block_length)
     return us
 
 

@@ -133,7 +133,7 @@ def _check_tensors(what: str, given: Any) -> None:
 
 
 def _tensors(env: Env) -> dict[str, torch.Tensor]:
-    """Return the tensors themselves."""
+    """Return the tensors that :func:`state_dict` copies, by name."""
     delays = env._actuator_state or ()
     named = {f"actuator state {i}": part for i, part in enumerate(delays)}
     return env._store.changing() | named | {CUT: env._log.cut}

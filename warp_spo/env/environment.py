@@ -429,7 +429,7 @@ class Env(VecEnv):
             self._failures.clear()
 
     def _parts(self) -> list[Part]:
-        """Return the parts of a step."""
+        """Return the parts of a step in order: the dynamics, last observations, judgement, new starts, observations."""
         after = [Part(lambda: self._after("judge")), *self._user_parts("judge")]
         last = [Part(self._after_reset), *self._user_parts("observe"), Part(self._observe)]
         final = [*self._user_parts("observe"), Part(self._observe_final)] if self.final else []

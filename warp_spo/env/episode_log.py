@@ -53,7 +53,7 @@ class Log:
         self.cut = torch.zeros(worlds, device=device)  # number of a world's episode whose age was written; 0: none
 
     def clear(self) -> None:
-        """Forget whose ages were written."""
+        """Let the current episodes of all worlds count in the report, also those whose ages were written."""
         self.cut.zero_()
 
     def write_ages(self, memory: torch.Tensor, written: torch.Tensor) -> None:

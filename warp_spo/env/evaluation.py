@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from .commands import HELD
+from .compile.guard import BEYOND, NOT_FINITE
 from .compile.memory_layout import count_steps
 from .environment import Env
 
@@ -62,11 +63,16 @@ def mean(values: torch.Tensor, valid: torch.Tensor) -> float:
 
 
 def episodes(env: Env, policy: Policy) -> dict[str, float]:
-    """Return the means of rewards, ends and lengths [s] over an episode of each world, as the log of a training has."""
+    """Return the means of rewards, ends and lengths [s] over an episode of each world, as the log of a training has.
+
+    Of what is not finite or beyond bounds, those terms that had any.
+    """
     observed, _ = env.reset(seed=env.seed)
     for _ in range(env.max_episode_length):
         observed, *_ = env.step(policy(observed))
-    return {"worlds": env.num_envs} | {name.lstrip("/"): float(value) for name, value in env.log().items()}
+    found = {name.lstrip("/"): float(value) for name, value in env.log().items()}
+    counted = lambda name: name.split("/")[0] in (NOT_FINITE, BEYOND)  # noqa: E731
+    return {"worlds": env.num_envs} | {name: x for name, x in found.items() if x or not counted(name)}
 
 
 def balance(env: Env, policy: Policy) -> dict[str, float]:

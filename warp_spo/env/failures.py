@@ -379,4 +379,5 @@ def check_failure_folder(folder: Any) -> Path:
 
 
 def _round_up(words: int) -> int:
+    """Return the least multiple of QUAD that is not below a number of words."""
     return math.ceil(words / kernels.QUAD) * kernels.QUAD

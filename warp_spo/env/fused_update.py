@@ -146,7 +146,7 @@ class FusedUpdate:
         self.norms, self.corrections = torch.zeros(2, device=device), torch.zeros(2, device=device)
 
     def learned_tensors(self) -> list[torch.Tensor]:
-        """Return the tensors that steps change."""
+        """Return the tensors that a step of the optimizer changes: weights, moments, the number of steps."""
         return [self.weights, self.first, self.second, self.steps]
 
     def deviation(self) -> torch.Tensor:
@@ -257,7 +257,7 @@ def start_compiling(device: str) -> None:
 
 
 def round_up(count: int, size: int) -> int:
-    """Return the next multiple of a size."""
+    """Return the least multiple of ``size`` that is not below ``count``."""
     return -(-count // size) * size
 
 

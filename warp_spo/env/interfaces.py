@@ -92,8 +92,13 @@ def make_vector(env: Env, tensors: bool = False, autoreset_mode: Any = "SameStep
                     f"step: autoreset_mode is 'Disabled' and episodes of worlds {waiting.tolist()} have ended; "
                     "expected reset(options={'reset_mask': terminated | truncated}) before the next step"
                 )
-            copies = checkpoint.copy_worlds(env, waiting) if len(waiting) else {}
-            observed, rewards, done, extras = env.step(given.to(env.device))
+            copies, given = checkpoint.copy_worlds(env, waiting) if len(waiting) else {}, given.to(env.device)
+            if len(waiting) and given.shape == (env.num_envs, env.num_actions):
+                given = given.clone()
+                given[waiting] = (
+                    0.0  # their steps are taken back; other actions might fail, and leave files of failures
+                )
+            observed, rewards, done, extras = env.step(given)
             ends, late = done.bool(), extras["time_outs"].bool()
             log = extras.get("log", {})
             if len(waiting):

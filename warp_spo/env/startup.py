@@ -28,7 +28,7 @@ class StartTimes:
         self._last, self.parts = began, list[tuple[str, float]]()
 
     def mark(self, name: str) -> None:
-        """Note that a part has ended."""
+        """Add a part by its name, with the seconds since the part before ended."""
         now = time.time()
         self.parts.append((name, now - self._last))
         self._last = now

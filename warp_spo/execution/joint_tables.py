@@ -15,7 +15,6 @@ from ..scene.parts import UNLIMITED
 from ..scene.scene import Scene
 
 MOST_PLACES = 256  # of dofs, each limb's even; tables hold a place in 8 bits
-HINGES = {"revolute", "prismatic", "helical", "fixed", "free", "ball"}
 NONE = 1e30  # a bound that no force or rate reaches
 SIGNS = {-1: 0, 0: 1, 1: 2}  # two bits of a column
 
@@ -36,12 +35,17 @@ class JointTables(NamedTuple):
 
 
 def joint_tables(
-    scene: Scene, pattern: tuple[np.ndarray, np.ndarray], near: int, slots: int, surfaces: list[range]
+    scene: Scene,
+    pattern: tuple[np.ndarray, np.ndarray],
+    near: int,
+    slots: int,
+    surfaces: list[range],
+    motors: tuple[int, ...],
 ) -> JointTables:
     """Return the tables of a scene whose packed mass matrix has rows and columns ``pattern``.
 
     ``near``: pairs at most that are near in a world. ``slots``: points of pairs at most. ``surfaces``: of each point
-    with the ground, the numbers of the surfaces that it may touch.
+    with the ground, the numbers of the surfaces that it may touch. ``motors``: see :func:`motor_laws`.
     """
     dofs_of = _dofs_by_body(scene)
     ways = _ways(scene)
@@ -53,10 +57,12 @@ def joint_tables(
     rows, cols = pattern
     sizes = joint_space.Sizes(
         scene.dof_count, tiles, len(rows), len(pairs), len(couples), max(map(len, columns), default=0), near,
-        slots + sum(map(len, surfaces)), sum(map(len, surfaces)), len(surfaces),
+        slots + sum(map(len, surfaces)), sum(map(len, surfaces)), len(surfaces), sum(motors),
     )  # fmt: skip
     entries, masks = _entries(rows, cols, position, tiles)
-    axis_body, point_body, coordinate, dof_values = _dofs(scene)
+    coordinate, dof_values = _dofs(scene)
+    own = [joint_space.DOF_VALUES.index(name) for name in ("stiffness", "ke", "kd")]
+    dof_values[np.ix_(np.flatnonzero(motors), np.array(own))] = 0.0
     table: list[int] = [*order, *entries]
     table += [(mask >> shift) & 0xFFFFFFFF for mask in masks for shift in range(0, 64 * sizes.words, 32)]
     for each in columns:
@@ -65,12 +71,13 @@ def joint_tables(
         table += [couples[_bodies(scene, pair)], len(scene.contact_points) + pair]
     numbers = [number for number, own in enumerate(surfaces) for _ in own]
     table += [x for number in numbers for x in (couples[scene.contact_points[number].body, -1], number)]
-    table += [*axis_body, *point_body, *coordinate]
+    table += coordinate
     met: list[list[int]] = [[] for _ in order]  # entry and the other dof, of each dof
     for entry, both in enumerate(zip(rows.tolist(), cols.tolist(), strict=True)):
         for i, j in {tuple(both), tuple(both[::-1])}:
             met[position[i]].append(entry << 8 | position[j])
     table += [*np.cumsum([0, *map(len, met)]).tolist(), *(x for row in met for x in sorted(row))]
+    table += np.cumsum([0, *motors]).tolist()
     assert len(table) == sizes.table_starts["END"]
     place = np.array(table, dtype=np.int64).astype(np.uint32).view(np.int32)
     return JointTables(sizes, place, np.ravel(dof_values), _pair_values(scene, pairs, numbers), pairs)
@@ -79,17 +86,7 @@ def joint_tables(
 def lacking(scene: Scene, variable: tuple[str, ...]) -> str:
     """Return what of a scene the solver in joint space does not take, in words; "" if nothing."""
     some: bool | np.bool
-    lacks = [f"{kind} hinges" for kind in sorted({hinge.kind for hinge in scene.hinges} - HINGES)]
-    lacks += ["hinges that share dofs"] * bool(scene.shares_dofs)
-    lacks += ["bodies with modes"] * any(body.modes is not None for body in scene.bodies)
-    lacks += ["actuators"] * bool(scene.actuators)
-    turns = [(hinge.kind in ("free", "ball"), dofs) for hinge, dofs in zip(scene.hinges, _dofs_of(scene), strict=True)]
-    for name in ("joint_stiffness", "joint_target_ke"):
-        some = name in variable or any(scene.values[name][:, dofs].any() for turn, dofs in turns if turn)
-        lacks += [f"{name} of ball and free hinges"] * (some and any(turn for turn, _ in turns))
-    for name in ("joint_X_p", "joint_X_c", "body_com"):
-        varies = name in variable or (scene.values[name] != scene.values[name][:1]).any()
-        lacks += [f"{name} that varies between worlds"] * bool(varies)
+    lacks = ["bodies with modes"] * any(body.modes is not None for body in scene.bodies)
     lacks += ["dofs without inertia"] * (not (neutral_inertias(scene) > 0.0).all())
     count = len(scene.contact_points)
     for name in TURNING_VALUES:
@@ -107,6 +104,24 @@ def why_few_pairs(scene: Scene) -> str:
     """Return why steps of a scene take only few pairs, whose code is generated; "" if joint space takes many."""
     lacks = lacking(scene, ())
     return f"steps of a scene with {lacks} do not solve so many" if lacks else ""
+
+
+def motor_laws(scene: Scene, variable: tuple[str, ...]) -> tuple[int, ...]:
+    """Return how many laws of its spring, drive and actuators each dof has that are computed with the bias force.
+
+    They are those of dofs with actuators, and of hinges that turn freely with springs or position drives.
+    """
+    counts = np.zeros(scene.dof_count, dtype=int)
+    for actuator in scene.actuators:
+        for hinge in actuator.hinges:
+            counts[scene.qd_start[hinge]] += 1
+    counts[counts > 0] += 2
+    for hinge, dofs in zip(scene.hinges, _dofs_of(scene), strict=True):
+        if hinge.coord_count > hinge.dof_count:
+            for name in ("joint_stiffness", "joint_target_ke"):
+                some = name in variable or scene.values[name][:, dofs].any()
+                counts[dofs] = np.maximum(counts[dofs], 2 * bool(some))
+    return tuple(counts.tolist())
 
 
 def _dofs_of(scene: Scene) -> list[np.ndarray]:
@@ -201,8 +216,8 @@ def _entries(rows: np.ndarray, cols: np.ndarray, position: dict[int, int], tiles
     return entries, masks
 
 
-def _dofs(scene: Scene) -> tuple[list[int], list[int], list[int], np.ndarray]:
-    """Return of each dof the body with its axis, the body with a point on it, its coordinate, and its constants."""
+def _dofs(scene: Scene) -> tuple[list[int], np.ndarray]:
+    """Return of each dof its coordinate, -1 where it has none of its own, and its constants."""
     count, value = scene.dof_count, lambda name: np.asarray(scene.values[name][0], dtype=np.float64)
     of = {name: np.zeros(count) for name in joint_space.DOF_VALUES}
     names = {"stiffness": "joint_stiffness", "damping": "joint_damping", "ke": "joint_target_ke",
@@ -219,31 +234,13 @@ def _dofs(scene: Scene) -> tuple[list[int], list[int], list[int], np.ndarray]:
     for name in ("lower", "upper"):
         bound = value(f"joint_limit_{name}")
         of[name] = np.where(np.abs(bound) < UNLIMITED, bound, NONE)
-    bodies = [[-1] * count, [0] * count, [-1] * count]
-    for body, h in enumerate(scene.hinge_of):
-        hinge = scene.hinges[h]
-        anchor, own = value("joint_X_p")[h], value("joint_X_c")[h]
-        for i, dof in enumerate(range(scene.qd_start[h], scene.qd_start[h + 1])):
-            point, linear, angular, axis = own[:3], 0.0, 1.0, np.eye(3)[i % 3]
-            if hinge.kind == "free":
-                linear, angular = (1.0, 0.0) if i < 3 else (0.0, 1.0)
-                point = value("body_com")[body]
-            elif hinge.kind != "ball":
-                axis, angular, linear = hinge.screws[i]
-                bodies[2][dof] = int(scene.q_start[h]) + i
-                of["rest"][dof] = value("joint_rest_q")[scene.q_start[h] + i]
-            bodies[0][dof], bodies[1][dof] = int(scene.tree.parent[body]), body
-            of["linear"][dof], of["angular"][dof] = linear, angular
-            for name, x in zip(("axis_x", "axis_y", "axis_z"), _turned(anchor[3:], axis), strict=True):
-                of[name][dof] = x
-            for name, x in zip("xyz", point, strict=True):
-                of[name][dof] = x
-    return *bodies, np.stack([of[name] for name in joint_space.DOF_VALUES], axis=1)  # type: ignore[return-value]
-
-
-def _turned(q: np.ndarray, x: np.ndarray) -> np.ndarray:
-    t = 2.0 * np.cross(q[:3], x)
-    return np.asarray(x) + q[3] * t + np.cross(q[:3], t)
+    coordinate = [-1] * count
+    for hinge, dofs, first in zip(scene.hinges, _dofs_of(scene), scene.q_start, strict=False):
+        for i, dof in enumerate(dofs.tolist()):
+            if hinge.coord_count == hinge.dof_count:
+                coordinate[dof] = int(first) + i
+                of["rest"][dof] = value("joint_rest_q")[first + i]
+    return coordinate, np.stack([of[name] for name in joint_space.DOF_VALUES], axis=1)
 
 
 def _pair_values(scene: Scene, pairs: list[int], numbers: list[int]) -> np.ndarray:

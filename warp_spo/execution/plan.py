@@ -117,12 +117,12 @@ class Plan:
             return self.tuned_plans[routine.name].of(routine)
         if routine.segments is None and not routine.has_node_form:
             return "tree"
-        chosen = self.granularity if self.forced else self._rule(routine)
+        chosen = self.granularity if self.forced else self._choose_for(routine)
         if chosen == "segment":
             return "segment" if routine.segments is not None else "tree"
         return chosen if routine.has_node_form else "tree"
 
-    def _rule(self, routine: Routine) -> str:
+    def _choose_for(self, routine: Routine) -> str:
         """Return the granularity that measured rules give a routine which has all forms; the first that applies.
 
         The plan's own granularity where the tree is not cut into several chains, or into too many for the warps of a
@@ -233,8 +233,10 @@ class Plan:
     def fuses_substeps(self, granularity: str) -> bool:
         """Whether one kernel takes all substeps faster than a launch each.
 
-        Measured on an H200, 2026-11-23: slower by up to 22 % where several blocks share a multiprocessor and their code
-        leaves the instruction cache, or what they hold the registers; they drift apart in it.
+        It does not where several blocks of 32 worlds share a multiprocessor and there are many dofs: blocks drift apart
+        in the loop over substeps, and each then fetches for itself code that the instruction cache no longer holds, or
+        values that the registers do not. Measured on an H200 in float32, 2026-11-23: up to 22 % slower. float64 has the
+        same bounds, unmeasured.
         """
         most = SPILLS["float32"] if granularity == "segment" else HELD
         return not self.device.cuda or self.dofs <= most or self.worlds <= WARP_SIZE * self.device.multiprocessors

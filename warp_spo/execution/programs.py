@@ -119,8 +119,8 @@ class Programs:
         """Return how many warps share worlds in a routine's kernels; None before one is built."""
         return max((program.warps for key, program in self._programs_in_use if key[0] is routine), default=None)
 
-    def described(self) -> list[str]:
-        """A line for each kernel: its granularity, its operations in one world, and on CUDA what it takes."""
+    def describe(self) -> list[str]:
+        """Return a line for each kernel: its granularity, its operations in one world, and on CUDA what it takes."""
         lines = []
         for key, program in self._programs_in_use:
             granularity = f"{key[3]}, {program.warps} warps" if program.warps > 1 else "tree"

@@ -126,13 +126,13 @@ def _keyframes(source: Source, mechanism: Mechanism) -> dict[str, Keyframe]:
     m = source.model
     return {
         source.name("key", key) or f"key_{key}": Keyframe(
-            *_state(source, mechanism, m.key_qpos[key], m.key_qvel[key]), np.array(m.key_ctrl[key])
+            *state_of(source, mechanism, m.key_qpos[key], m.key_qvel[key]), np.array(m.key_ctrl[key])
         )
         for key in range(m.nkey)
     }
 
 
-def _state(source: Source, mechanism: Mechanism, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def state_of(source: Source, mechanism: Mechanism, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return q and qd of a state; see :class:`Coordinates`, which does the same in kernels."""
     m, joint_of = source.model, {hinge: joint for joint, hinge in mechanism.hinge_of.items()}
     q, qd = [np.zeros(0)], [np.zeros(0)]

@@ -55,7 +55,7 @@ class Pivot(NamedTuple):
         return Pivot(None, column, U, self.D, self.inverse, turned=True)
 
     def share(self, x: Value) -> Value:
-        """D^-1 x"""
+        """Return D^-1 x: the rate, or acceleration, that a force x on the pivot's dof makes."""
         return quotient(x, self.D) if self.unit is None and not self.turned else x * self.inverse
 
 

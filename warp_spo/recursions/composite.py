@@ -22,7 +22,8 @@ def entries(
 ) -> dict[tuple[int, int], Value]:
     """(row, column) of Mass for the columns of a link that carries ``body`` = R, rows on the way to the root.
 
-    The forces of a group's columns on its parent are added up in ``shared``, and go on from its last link.
+    Links of a group have dofs in common, see :mod:`.model.shared_dofs`: their forces on the parent are added up in
+    ``shared``, by column, and go on to the root from the group's last link.
     """
     found = own_entries(link, places[id(link)], body)
     for (i, j), x in link.coupling_inertia.items():

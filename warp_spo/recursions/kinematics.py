@@ -89,15 +89,15 @@ def jacobian(trace: Trace, frames: tuple) -> list[Store]:
 def link_poses(trace: Trace) -> tuple[dict[int | None, Vector], dict[int | None, Quaternion]]:
     """Return the origin and the quaternion of every link in the inertial frame, by id; None is that frame itself."""
     q = trace.vector("q")
-    at: dict[int | None, Vector] = {None: ZERO}
-    turns: dict[int | None, Quaternion] = {None: NEUTRAL}
+    origins: dict[int | None, Vector] = {None: ZERO}
+    quaternions: dict[int | None, Quaternion] = {None: NEUTRAL}
     for link in trace.active_links:
         trace.label(link, "p")
-        over = None if link.parent is None else id(link.parent)
+        parent = None if link.parent is None else id(link.parent)
         trace.places[id(link)] = place = place_link(link, q)
-        at[id(link)] = at[over] + turned(turns[over], place.pose.l)
-        turns[id(link)] = multiply(turns[over], relative_quaternion(link, q))
-    return at, turns
+        origins[id(link)] = origins[parent] + turned(quaternions[parent], place.pose.l)
+        quaternions[id(link)] = multiply(quaternions[parent], relative_quaternion(link, q))
+    return origins, quaternions
 
 
 def quaternions_in_links(links: Links) -> dict[int, Quaternion]:
@@ -163,9 +163,9 @@ def link_velocities(trace: Trace) -> dict[int | None, Twist]:
     for link in trace.active_links:
         place_axes(trace, link)
         trace.label(link, "v")
-        place, over = trace.places[id(link)], None if link.parent is None else id(link.parent)
+        place, parent = trace.places[id(link)], None if link.parent is None else id(link.parent)
         hinge = hinge_motion(link, place, trace.vector("qd"))
-        velocities[id(link)] = carried_velocity(place, velocities[over], hinge)
+        velocities[id(link)] = carried_velocity(place, velocities[parent], hinge)
     return velocities
 
 

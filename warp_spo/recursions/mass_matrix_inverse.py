@@ -86,7 +86,7 @@ class Inverse:
         for at, j in enumerate(segment.dofs):
             trace.graph.step = f"column {j}|m"
             for i in segment.dofs[: at + 1]:
-                self.entries[i, j] = _meeting(weighted[i], self._columns[j])
+                self.entries[i, j] = _sum_over_shared_pivots(weighted[i], self._columns[j])
         if not segment.children:
             return
         trace.label(segment.links[-1], "n")
@@ -115,10 +115,12 @@ class Inverse:
         for at, i in enumerate(other.dofs):
             self.trace.graph.step = f"column {i}|m"
             theirs = [d * y for d, y in zip(D, sent[length * at : length * at + common], strict=True)]
-            self.shared_entries.append({(i, j): _meeting(theirs, self._columns[j]) for j in segment.dofs})
+            self.shared_entries.append(
+                {(i, j): _sum_over_shared_pivots(theirs, self._columns[j]) for j in segment.dofs}
+            )
 
 
-def _meeting(first: list[Value], second: list[Value]) -> Value:
+def _sum_over_shared_pivots(first: list[Value], second: list[Value]) -> Value:
     """Return the sum of products over the pivots that both share."""
     return total(a * b for a, b in zip(first, second, strict=False))
 

@@ -26,8 +26,8 @@ from ..trace.spatial import IDENTITY, ZERO, Pose, Rigid, Twist, Vector, cross, d
 from .articulated import columns
 from .kinematics import place_all
 from .model.link import BodyPlacement, Link
-from .model.rotations import folded
-from .model.rotors import locked, own_link
+from .model.rotations import fold_rotation
+from .model.rotors import locked_inertia, own_link
 
 if TYPE_CHECKING:
     from .model.tracing import Trace
@@ -162,7 +162,7 @@ def _inertia(trace: Trace, node: int) -> list[list[Value]]:
     if node not in links.flexible:
         whole = links.nodes[node].rigid
         for child, hinge in riders:
-            whole = whole + locked(hinge.rotor, *links.nodes[child].tree)
+            whole = whole + locked_inertia(hinge.rotor, *links.nodes[child].tree)
         P = whole.articulated
         return [[P.entry(i, j) for j in range(6)] for i in range(6)]
     own, placement = links.flexible[node], links.placements[node]
@@ -184,7 +184,9 @@ def _inertia(trace: Trace, node: int) -> list[list[Value]]:
         assert port is not None
         moved = [Vector(_flat(trace.places[id(port)].pose.motion_to_child(*motion))) for motion in rigid]
         anchor = links.poses["joint_X_p"][scene.hinge_of[child]][0]
-        pieces.append((locked(hinge.rotor, folded(anchor), ZERO), [*columns(port, trace.places[id(port)]), *moved]))
+        pieces.append(
+            (locked_inertia(hinge.rotor, fold_rotation(anchor), ZERO), [*columns(port, trace.places[id(port)]), *moved])
+        )
     for inertia, J in pieces:
         forces = [_flat(inertia.apply(Vector(column[:3]), Vector(column[3:]))) for column in J]
         for i in range(n + 6):

@@ -43,7 +43,7 @@ class Operators:
     def stores(self, expression: Expression) -> list[Store]:
         """out = expression x"""
         rows, columns = spaces(expression)
-        result = self.applied(expression, self.input_vector(columns or rows or NODES))
+        result = self.apply(expression, self.input_vector(columns or rows or NODES))
         found = []
         for node in self._inward_order():
             values = result(node)
@@ -56,7 +56,7 @@ class Operators:
 
         def at(node: int) -> Vector:
             first = self._first(space, node)
-            self._at(node, "x")
+            self._label(node, "x")
             return Vector(self.graph.input("x", first + i) for i in range(self._size(space, node)))
 
         return at
@@ -67,7 +67,7 @@ class Operators:
     def _size(self, space: str, node: int) -> int:
         return 6 if space == NODES else self.scene.hinge_sizes[node]
 
-    def _at(self, node: int, letter: str) -> None:
+    def _label(self, node: int, letter: str) -> None:
         self.graph.step = f"body {node}|{letter}"
 
     def _inward_order(self) -> Iterator[int]:
@@ -82,7 +82,7 @@ class Operators:
             stack += [(child, False) for child in reversed(self.scene.tree.children[node])]
 
     # -- composing -------------------------------------------------------------------------------------------------
-    def applied(self, expression: Expression, x: Field, transposed: bool = False) -> Field:
+    def apply(self, expression: Expression, x: Field, transposed: bool = False) -> Field:
         """Return ``expression x``, or the transpose times x."""
         if isinstance(expression, str):
             return self._letter(expression, x, transposed)
@@ -90,26 +90,26 @@ class Operators:
         if form == "identity":
             return x
         if form == "transpose":
-            return self.applied(operands[0], x, not transposed)
+            return self.apply(operands[0], x, not transposed)
         if form == "scaled":
-            factor, y = operands[0], self.applied(operands[1], x, transposed)
+            factor, y = operands[0], self.apply(operands[1], x, transposed)
             return _once(lambda node: y(node) * factor)
         if form == "resolvent":
             weight = self._weight(operands[0] == "E_psi", transposed)
             return self._outward(x, weight) if transposed else self._inward(x, weight)
         if form == "product":
             for factor in operands if transposed else reversed(operands):
-                x = self.applied(factor, x, transposed)
+                x = self.apply(factor, x, transposed)
             return x
-        terms = [self.applied(term, x, transposed) for term in operands]
+        terms = [self.apply(term, x, transposed) for term in operands]
 
-        def added(node: int) -> Vector:
+        def add_terms(node: int) -> Vector:
             result = terms[0](node)
             for term in terms[1:]:
                 result = result + term(node)
             return result
 
-        return _once(added)
+        return _once(add_terms)
 
     def _letter(self, letter: str, x: Field, transposed: bool) -> Field:
         if letter in ("E_phi", "E_psi"):
@@ -118,8 +118,8 @@ class Operators:
                 return _once(lambda node: self._from_parent(node, x, weight))
             return _once(lambda node: self._from_children(node, x, weight))
         if letter == "D":
-            lever = self.applied("H", self.applied("P", self.applied("H", x, True)))
-            offset = self.applied("Delta", x)
+            lever = self.apply("H", self.apply("P", self.apply("H", x, True)))
+            offset = self.apply("Delta", x)
             return _once(lambda node: lever(node) + offset(node))
         steps: dict[str, Callable[[int, Vector], Vector]] = {
             "H": self._spread if transposed else self._collect,
@@ -147,7 +147,7 @@ class Operators:
                 elif node in waiting:
                     stack.pop()
                     value = x(node)
-                    self._at(node, "y")
+                    self._label(node, "y")
                     known[node] = value + sums[node] if node in sums else value
                     self._hand_on(node, known[node], weight, sums)
                 else:
@@ -174,7 +174,7 @@ class Operators:
                 node = self.parent[node]
             for below in reversed(path):
                 value = x(below)
-                self._at(below, "v")
+                self._label(below, "v")
                 if self.parent[below] >= 0:
                     value = value + weight(below, known[self.parent[below]])
                 known[below] = value
@@ -203,13 +203,13 @@ class Operators:
         for link, pose in reversed(self.hops(node)):
             if link is not None and less:
                 _, z = self._eliminate(link, z, [0.0] * len(link.dofs))
-            self._at(node, "z")
+            self._label(node, "z")
             z = _join(pose.force_to_parent(*_parts(z)))
         return z
 
     def _motion(self, node: int, v: Vector, less: bool) -> Vector:
         for link, pose in self.hops(node):
-            self._at(node, "v")
+            self._label(node, "v")
             v = _join(pose.motion_to_child(*_parts(v)))
             if link is not None and less:
                 _, v = self._release(link, v)
@@ -218,7 +218,7 @@ class Operators:
     # -- hinges ----------------------------------------------------------------------------------------------------
     def _collect(self, node: int, z: Vector) -> Vector:
         """H z"""
-        self._at(node, "h")
+        self._label(node, "h")
         tau: list[Value] = []
         for link, pose, first in self._inner(node):
             if link is not None:
@@ -229,7 +229,7 @@ class Operators:
 
     def _spread(self, node: int, rates: Vector) -> Vector:
         """H* rates"""
-        self._at(node, "h")
+        self._label(node, "h")
         v, at = Vector((*ZERO, *ZERO)), 0
         for link, pose, first in reversed(self._inner(node)):
             if not first:
@@ -242,7 +242,7 @@ class Operators:
         return v
 
     def _armature(self, node: int, x: Vector) -> Vector:
-        self._at(node, "d")
+        self._label(node, "d")
         own = [a for link in self.chains[node] for a in link.armature]
         return Vector(a * value for a, value in zip(own, x, strict=True))
 
@@ -256,7 +256,7 @@ class Operators:
                 _, z = self._eliminate(link, z, list(right[at : at + len(link.dofs)]))
             if not first:
                 z = _join(pose.force_to_parent(*_parts(z)))
-        self._at(node, "g")
+        self._label(node, "g")
         for _, pose, first in reversed(inner):
             if not first:
                 n, f = _parts(z)
@@ -264,12 +264,13 @@ class Operators:
         return z
 
     def _gain_transposed(self, node: int, v: Vector) -> Vector:
-        """Return G* v, by dof of the node's hinge, for a motion v = (omega; v) in the node's frame.
+        """Return G* v, by dof of the node's hinge, for a motion v = (omega; v) in the node's frame; G = P H* D^-1.
 
-        The motion is first taken inward to the frame of the hinge's first link; from there outward, each link's pivots
-        take their share.
+        A node's hinge may be several links in series. The motion is first carried inward to the frame of the first of
+        them, as if the hinge stood still. From there outward each link gives the rates of its own dofs, and hands on
+        the motion less that of these rates, see :meth:`_release`.
         """
-        self._at(node, "g")
+        self._label(node, "g")
         inner, rates = self._inner(node), []
         for _, pose, first in inner:
             if not first:
@@ -306,7 +307,7 @@ class Operators:
     def _eliminate(self, link: Link, z: Vector, right: list[Value]) -> tuple[list[Value], Vector]:
         """D^-1 (right - H z), pivot by pivot, and z + G (right - H z), of one link, in its frame."""
         done, place, rates = self.factor(link), self.place(link), []
-        self._at(link.node, "z")
+        self._label(link.node, "z")
         if done.turned:
             triples = [link.hinge.in_link_axes(place, right[i : i + 3]) for i in range(0, len(right), 3)]
             right = [x for triple in triples for x in triple]
@@ -318,7 +319,7 @@ class Operators:
     def _release(self, link: Link, v: Vector, given: list[Value] | None = None) -> tuple[list[Value], Vector]:
         """Return rates = G* v - ``given`` by dof, and v - H* rates: the adjoint of :meth:`_eliminate`."""
         done, place, rates = self.factor(link), self.place(link), []
-        self._at(link.node, "v")
+        self._label(link.node, "v")
         given = [0.0] * len(done.pivots) if given is None else given
         for pivot, own in zip(done.pivots[::-1], given[::-1], strict=True):
             rates.append(pivot.inverse * dot(pivot.U, v) - own)
@@ -329,12 +330,12 @@ class Operators:
 
     # -- bodies ----------------------------------------------------------------------------------------------------
     def _momentum(self, node: int, v: Vector) -> Vector:
-        self._at(node, "m")
+        self._label(node, "m")
         return _join(self.links.nodes[node].rigid.apply(*_parts(v)))
 
     def _apply_inertia(self, node: int, v: Vector) -> Vector:
         P = self.inertia(node)
-        self._at(node, "p")
+        self._label(node, "p")
         return _join(P.apply(*_parts(v)))
 
     def inertia(self, top: int) -> Articulated:
@@ -348,7 +349,7 @@ class Operators:
             for child in self.scene.tree.children[node]:
                 link, pose = self.hops(child)[0]
                 done = None if link is None else self.factor(link)
-                self._at(node, "P")
+                self._label(node, "P")
                 if done is None or not done.whole:  # a free hinge hands nothing on
                     P = P + pose.articulated_to_parent(self._inertias[child] if done is None else done.P)
             self._inertias[node] = P

@@ -58,7 +58,7 @@ def quasi_velocity_coriolis(trace: Trace) -> list[Store]:
     """out = C(q, nu) = -nu' where no force acts: nu changes with its factor, and because qd does"""
     done = factor_by_dofs(trace)
     qd = _unscale(trace, done, trace.vector("nu"))
-    _move(trace, qd.__getitem__)
+    _set_velocities(trace, qd.__getitem__)
     by_acceleration = _accelerate(trace, done, lambda dof: 0.0, (ZERO, ZERO))
     by_factor = _change(trace, done, qd)
     return _stores({dof: -(rate + by_factor[dof]) for dof, rate in by_acceleration.items()})
@@ -128,8 +128,8 @@ def _carry(trace: Trace, link: Link, velocity: dict[int, Vector]) -> Vector:
     return Vector((*w, *v))
 
 
-def _move(trace: Trace, qd: Entry) -> None:
-    """Give all links the velocity terms of qd."""
+def _set_velocities(trace: Trace, qd: Entry) -> None:
+    """Set the velocity terms of all links, ``trace.motions``, to those at the rates ``qd``."""
     for link in trace.links.links:
         trace.label(link, "w")
         parent = None if link.parent is None else trace.motions[id(link.parent)]

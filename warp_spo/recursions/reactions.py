@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def body_accelerations(trace: Trace) -> list[Store]:
     """out [body, 6] = acceleration of the CoM, angular acceleration"""
-    _, alpha = _moving(trace)
+    _, alpha = _link_motions(trace)
     stores = []
     for body in trace.links.placements:
         link, com = trace.links.center(body)
@@ -35,7 +35,7 @@ def body_reactions(trace: Trace) -> list[Store]:
 
     The wrench on a body accelerates it and is passed on to its children; moments are about CoMs.
     """
-    origins, alpha = _moving(trace)
+    origins, alpha = _link_motions(trace)
     tree, placements, stores = trace.links.scene.tree, trace.links.placements, []
     still = -trace.places[id(trace.links.links[0])].pose.l  # the inertial frame's origin, seen from the first link's
     forces: dict[int, Wrench] = {}
@@ -65,7 +65,7 @@ def body_reactions(trace: Trace) -> list[Store]:
     return stores
 
 
-def _moving(trace: Trace) -> tuple[dict[int, Vector], dict[int, Twist]]:
+def _link_motions(trace: Trace) -> tuple[dict[int, Vector], dict[int, Twist]]:
     """Return origins and accelerations of all links, with gravity as an acceleration of the base."""
     origins = place_all(trace, moves=True)
     qdd = trace.vector("qdd")

@@ -83,8 +83,8 @@ def convex_hull(call: str, points: np.ndarray, known: np.ndarray, most: int = MO
 @functools.lru_cache(maxsize=256)
 def _remembered_hull(points: bytes, known: bytes, most: int) -> tuple[Hull, np.ndarray]:
     """Return :func:`convex_hull` of points as bytes: a shape has a hull in each of its pairs."""
-    given, on = (np.frombuffer(array).reshape(-1, 3) for array in (points, known))
-    return _convex_hull("", given, on, most)
+    all_points, on_hull = (np.frombuffer(array).reshape(-1, 3) for array in (points, known))
+    return _convex_hull("", all_points, on_hull, most)
 
 
 def _convex_hull(call: str, points: np.ndarray, known: np.ndarray, most: int) -> tuple[Hull, np.ndarray]:

@@ -25,7 +25,7 @@ from ...recursions.derivatives.contact_pass import (
     NUMBER,
     ROW,
     contact_pass,
-    count_laws,
+    count_law_variables,
     count_variables,
     weighed_segments,
 )
@@ -77,19 +77,22 @@ def launch(
     rounds: int | None = None,
     **given: Any,
 ) -> None:
-    """Launch the gradients of a step, into ``out`` by the first name of ``wrt`` and into ``more`` by the others.
+    """Launch the gradients of a step, into ``out`` by the first name of ``wrt``, into ``more`` by the others in order.
 
     Args:
-        passes, rounds: as of the step. given: arrays and numbers by name: arguments of the step, "qdd" that it found,
-            and the cotangents of its results.
+        passes, rounds: how many passes, and iterations of the midpoint scheme, the step took; None: its defaults.
+        given: arrays and numbers by name: arguments of the step, "qdd" that it found, and the cotangents of its
+            results; None for one that was left out.
     """
-    count = PASSES if passes is None else passes
+    pass_count = PASSES if passes is None else passes
     given = {name: value for name, value in given.items() if value is not None}
     results = dict(zip(wrt, (out, *more.values()), strict=True))
-    if made := midpoint_contact.count_rounds(dyn.scene, count, rounds):
-        midpoint_contact_gradients.backpropagate(dyn, functools.partial(_launch, dyn), results, count, made, **given)
+    if rounds_made := midpoint_contact.count_rounds(dyn.scene, pass_count, rounds):
+        midpoint_contact_gradients.backpropagate(
+            dyn, functools.partial(_launch, dyn), results, pass_count, rounds_made, **given
+        )
     else:
-        _launch(dyn, results, count, **given)
+        _launch(dyn, results, pass_count, **given)
 
 
 def _launch(dyn: Dynamics, asked: dict[str, wp.array], count: int, **given: Any) -> None:
@@ -148,5 +151,5 @@ def _laws(dyn: Dynamics, inputs: tuple[str, ...]) -> tuple[tuple[int, ...], tupl
     known = dyn._gradients.pass_laws
     if inputs not in known:
         traces = (Trace(dyn.programs.links.with_tables(), dyn.dtype.__name__, inputs) for _ in range(2))
-        known[inputs] = count_laws(next(traces)), weighed_segments(next(traces))
+        known[inputs] = count_law_variables(next(traces)), weighed_segments(next(traces))
     return known[inputs]

@@ -67,17 +67,20 @@ def turns(dyn: Dynamics) -> bool:
     return any(turning_names(scene, variable, number) for number in range(len(scene.contact_points)))
 
 
-def check_rounds(dyn: Dynamics, call: Call, rounds: Any) -> int | None:
-    """Return the checked number of rounds of a step with contacts; None where the caller gives none."""
+def check_rounds(dyn: Dynamics, call: Call, integrator: str, rounds: Any) -> int | None:
+    """Return the checked number of rounds of a step; None where the caller gives none."""
     if rounds is None:
         return None
     count = as_integer(rounds)
     if count is None or count < 0:
         raise ValueError(f"{call.name}: rounds is {rounds!r}; expected an integer, 0 or more")
-    if not dyn.scene.contacts:
-        raise ValueError(f"{call.name}: rounds is given, and the scene has no contacts; expected None")
-    if count and dyn.scene.contact_pairs:
-        raise UnsupportedError(call.name, f"rounds={count} where bodies touch each other", "leave it out")
+    obstacles = {
+        "where bodies touch each other": dyn.scene.contact_pairs,
+        "where loops are closed": dyn.closed,
+        f"with integrator={integrator!r}": integrator != "semi_implicit",
+    }
+    for where in filter(obstacles.get, obstacles) if count else ():
+        raise UnsupportedError(call.name, f"rounds={count} {where}", "leave it out")
     return count
 
 

@@ -96,7 +96,7 @@ def semi_implicit(
 
     Args:
         qdd, status: arrays to fill, see :meth:`Dynamics.step`; reports: others, by name. bodies: arrays for poses and
-            velocities of the bodies after the step. passes, rounds: of scenes with contacts.
+            velocities of the bodies after the step. passes: of scenes with contacts. rounds: of the midpoint scheme.
         substeps: more than one only where :func:`several_launches` names no reason against it.
         given: forces and targets by name. With ``q_from``, ``qd_from`` the step starts from that state, while its sweep
             and the laws of its joints are evaluated at q, qd.
@@ -121,6 +121,8 @@ def semi_implicit(
             midpoint_contact.step(dyn, dt, (q_out, qd_out), more | (reports or {}), q, qd, made, **given)
         else:
             launch(contact_routine(dyn), qd_out, more | (reports or {}), qd=qd, dt=dt, q=q, **given)
+    elif rounds:
+        midpoint_contact.step(dyn, dt, (q_out, qd_out), more, q, qd, rounds, STEP, **given, **option)
     elif not dyn.closed:
         if bodies is not None and substeps == 1 and not _walks(dyn):
             further = more | {"poses_out": bodies[0], "velocities_out": bodies[1]}
@@ -174,7 +176,7 @@ def several_launches(
     """Return why substeps take a launch each; "" if one kernel takes all of them.
 
     Args:
-        acts: controls are given. delays: some are delayed. passes, rounds: of a step with contacts.
+        acts: controls are given. delays: some are delayed. passes: of a step with contacts. rounds: of a step.
     """
     if integrator != "semi_implicit":
         return f"integrator={integrator!r} takes several"
@@ -182,7 +184,8 @@ def several_launches(
         return "loops='multipliers' takes several"
     if dyn.scene.contact_pairs:
         return "bodies that touch each other take one for each"
-    if passes is not None and midpoint_contact.count_rounds(dyn.scene, passes, rounds):
+    made = midpoint_contact.count_rounds(dyn.scene, passes, rounds) if passes is not None else rounds
+    if made:
         asked = f"{passes} passes" if rounds is None else f"rounds={rounds}"
         return f"{asked} take{'s' if rounds else ''} iterations of the midpoint scheme"
     if delays:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import warp as wp
 
-from ...execution.joint_tables import joint_tables, lacking
+from ...execution.joint_tables import joint_tables, lacking, motor_laws
 from ...execution.routine import Routine
 from ...kernels import convex_pairs, joint_space, near_pairs
 from ...recursions import coordinates
@@ -21,7 +21,7 @@ from ...runtime import launches
 from ...scene.contact_shapes import BOX, ConvexShape
 from ...scene.ground import HEIGHTS
 from ...scene.scene import Scene
-from ..convex_contacts import PairShape, rotated, shape_rows
+from ..convex_contacts import PairShape, rotate, shape_rows
 from ..inertia import MASS_MATRIX_PACKED
 from ..kinematics import BODY_STATES
 
@@ -107,7 +107,8 @@ class JointSpaceStep:
         self.slot_count = slots = chosen[1] if slots is None else slots
         pattern = dyn.mass_matrix_pattern
         surfaces = surface_numbers(scene, HEIGHTS in dyn.variable)
-        tables = joint_tables(scene, pattern, near, slots, surfaces)
+        self.motor_laws = motors = motor_laws(scene, dyn.variable)
+        tables = joint_tables(scene, pattern, near, slots, surfaces, motors)
         sizes = tables.sizes
         while self.device.is_cuda and slots > near and joint_space.world_bytes(sizes, T) > ROOM:
             self.slot_count = slots = max(near, slots - 8)
@@ -127,6 +128,8 @@ class JointSpaceStep:
         self.near = make(self.worlds * (1 + 2 * near), dtype=int)
         self.touches = make(self.worlds, near * joint_space.MOST * joint_space.POINT)
         self.surfaces = make(self.worlds, max(1, sizes.surfaces * joint_space.SURFACE))
+        self.screws = make(self.worlds, scene.dof_count * joint_space.SCREW)
+        self.motors = make(self.worlds, max(1, sizes.laws * joint_space.LAW))
         n, contacts = scene.dof_count, scene.contact_count
         self.neutral = array(np.tile(scene.neutral_q, (self.worlds, 1)))
         self.mass, self.poses = make(self.worlds, len(pattern[0])), make(self.worlds, scene.body_count, 7)
@@ -167,7 +170,7 @@ class JointSpaceStep:
         for pair in pairs:
             for body, shape in zip((pair.body, pair.other), pair.shapes, strict=True):
                 row = numbers[id(shape)]
-                at = shape.pose[:3] + rotated(shape.pose[3:], rows.middles[row])
+                at = shape.pose[:3] + rotate(shape.pose[3:], rows.middles[row])
                 sizes = shape.size + shape.radius
                 ball = float(np.linalg.norm(shape.size)) + shape.radius
                 if shape.hull is not None:
@@ -212,24 +215,33 @@ class JointSpaceStep:
         """
         tau, (target_q, target_qd) = self.still if tau is None else tau, targets
         system = [self.mass, self.bias, tau, q, qd, self.neutral if target_q is None else target_q]
-        system += [self.still if target_qd is None else target_qd, self.poses, self.near, self.touches, self.surfaces]
-        system += [self.dof_values, self.pair_values, self.place]
+        system += [self.still if target_qd is None else target_qd, self.screws, self.near, self.touches, self.surfaces]
+        system += [self.motors, self.dof_values, self.pair_values, self.place]
         names = "qd_out", "qdd", "contact_f", "contact_gap", "contact_slip", "excess", "status"
         out = [(results or {}).get(name, getattr(self, name)) for name in names]
         a_world = self.lanes if self.device.is_cuda else 1
         numbers = [dt, float(passes), *self.tolerances]
         self._launch(self.solver, a_world * self.worlds, system + numbers, out, joint_space.BLOCK)
 
-    def find_system(self, q: wp.array, qd: wp.array, dt: float, body_f: wp.array | None = None) -> None:
-        """Compute mass, poses, velocities, bias, surfaces, and what varies between worlds, of a state."""
+    def find_system(self, q: wp.array, qd: wp.array, dt: float, **acting: wp.array | None) -> None:
+        """Compute mass, poses, velocities, bias, surfaces, and what varies between worlds, of a state.
+
+        ``acting``: body_f; ctrl, target_q and target_qd of motors.
+        """
         engine, sizes = self.dyn._engine, self.tables.sizes
         engine.launch(MASS_MATRIX_PACKED, self.mass, q=q)
         engine.launch(BODY_STATES, self.poses, {"velocities_out": self.velocities}, q=q, qd=qd)
-        more = {joint_system.SURFACES: self.surfaces} if sizes.surfaces else {}
+        more = {joint_system.SCREWS: self.screws}
+        more |= {joint_system.SURFACES: self.surfaces} if sizes.surfaces else {}
         if self.names is not None:
             more |= {joint_system.OF_DOFS: self.dof_values, joint_system.OF_PAIRS: self.pair_values}
-        options = dict(surfaces=bool(sizes.surfaces), pairs=tuple(self.tables.pairs), names=self.names)
-        engine.launch_routine(SYSTEM, self.bias, more, q=q, qd=qd, dt=dt, body_f=body_f, **options)
+        if sizes.laws:
+            more |= {joint_system.OF_MOTORS: self.motors}
+        else:
+            acting = {name: array for name, array in acting.items() if name == "body_f"}
+        options: dict[str, Any] = dict(pairs=tuple(self.tables.pairs), motors=self.motor_laws, names=self.names)
+        options["surfaces"] = bool(sizes.surfaces)
+        engine.launch_routine(SYSTEM, self.bias, more, q=q, qd=qd, dt=dt, **acting, **options)
 
     def step(
         self,
@@ -241,10 +253,11 @@ class JointSpaceStep:
         passes: int = PASSES,
         q_out: wp.array | None = None,
         body_f: wp.array | None = None,
+        ctrl: wp.array | None = None,
         results: dict[str, wp.array] | None = None,
     ) -> wp.array:
         """Return qd after the step; with ``q_out`` also q. ``targets``: q and qd of the drives, None is the neutral."""
-        self.find_system(q, qd, dt, body_f)
+        self.find_system(q, qd, dt, body_f=body_f, ctrl=ctrl, target_q=targets[0], target_qd=targets[1])
         self.find_points(dt)
         self.solve(q, qd, tau, targets, dt, passes, results)
         after = (results or {}).get("qd_out", self.qd_out)
@@ -267,13 +280,12 @@ class JointSpaceStep:
         ctrl: wp.array | None = None,
     ) -> None:
         """Launch the step of :meth:`Dynamics.step`; ``after``: arrays for q and qd, ``reports``: others by name."""
-        assert ctrl is None, "lacking() names actuators"
         for name in (RESIDUAL, "contact_moment"):
             if name in reports:
                 launches.fill(reports[name], 0)
         renamed = {"contact_excess": "excess"}
         results = {renamed.get(name, name): array for name, array in reports.items()} | {"qd_out": after[1]}
-        self.step(q, qd, tau, (target_q, target_qd), dt, passes, after[0], body_f, results)
+        self.step(q, qd, tau, (target_q, target_qd), dt, passes, after[0], body_f, ctrl, results)
 
     @property
     def fits(self) -> bool:

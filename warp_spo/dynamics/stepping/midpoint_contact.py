@@ -1,8 +1,8 @@
-"""The midpoint scheme of steps with contacts: velocity terms act as two half-step impulses.
+"""The midpoint scheme of steps: velocity terms act as two half-step impulses.
 
-Steps of MIDPOINT_PASSES passes and more use it, and others that ask for rounds. Each round evaluates the velocity terms
-at the midpoint of the previous round's step and repeats the step with them. Each makes all passes. Then velocity terms
-are evaluated at the midpoint of the last one's step, see
+Steps with contacts of MIDPOINT_PASSES passes and more use it, and all others that ask for rounds. Each round evaluates
+the velocity terms at the midpoint of the previous round's step and repeats the step with them, with all its passes.
+Then velocity terms are evaluated at the midpoint of the last one's step, see
 :mod:`warp_spo.recursions.contact.velocity_kicks`.
 """
 
@@ -74,13 +74,16 @@ class MidpointIteration(NamedTuple):
     found: wp.array
     gained: wp.array
 
-    def step(self, q: wp.array) -> dict[str, wp.array]:
-        """Return what the passes of the iteration read for the coordinates ``q`` before the step, by name."""
-        return {"q": self.q, START: q, KICK: self.kick, PATH: self.path}
+    def step(self, q: wp.array, path: bool = True) -> dict[str, wp.array]:
+        """Return what the step of the iteration reads for the coordinates ``q`` before the step, by name.
+
+        ``path``: contacts read along which rates q moves.
+        """
+        return {"q": self.q, START: q, KICK: self.kick} | ({PATH: self.path} if path else {})
 
 
 def count_rounds(scene: Scene, passes: float, rounds: int | None) -> int:
-    """Return how many rounds of so many passes a step of the midpoint scheme makes; 0 where it is another step.
+    """Return how many rounds of so many passes a step with contacts makes; 0 where it is not of the midpoint scheme.
 
     Args:
         rounds: as the caller gives it. None: ITERATIONS from MIDPOINT_PASSES passes on, unless pairs of bodies touch.
@@ -98,11 +101,13 @@ def step(
     q: wp.array,
     qd: wp.array,
     rounds: int,
+    routine: Routine = CONTACT_STEP,
     **given: Any,
 ) -> None:
     """Launch a step of the midpoint scheme, of so many ``rounds``.
 
     Args:
+        routine: what a round makes between its kick and the next one.
         ends: arrays for q and qd after it. more: further arrays to fill, by name. given: arguments of the step, with
             its "passes", "reports" and options.
     """
@@ -113,7 +118,7 @@ def step(
     )
     options: dict[str, Any] = {name: given.pop(name) for name in ("qdd", "status") if name in given}
     further = {"qdd_out": more["qdd_out"]} if "qdd" in options else {}
-    last = run(dyn, dt, q, qd, rounds, given, more | {"q_out": q_out}, options)[-1]
+    last = run(dyn, dt, q, qd, rounds, given, more | {"q_out": q_out}, options, routine=routine)[-1]
     state: dict[str, Any] = {"q": q, "qd": qd, "dt": dt, PREVIOUS_RATES: last.found, PREVIOUS_KICK: last.kick}
     state |= {PASS_ACCELERATION: last.gained, "qdd": True} if further else {}
     dyn._engine.launch_routine(FINAL_KICK, qd_out, further, **state)
@@ -137,31 +142,36 @@ def run(
     more: dict[str, wp.array],
     options: dict[str, Any],
     gains: bool = False,
+    routine: Routine = CONTACT_STEP,
 ) -> list[MidpointIteration]:
     """Launch the iterations of a step of so many ``rounds`` without the final kick, and return them.
 
     Args:
         given: arguments of the step. more: arrays that the last iteration fills, by name, for these ``options``.
-        gains: fill in :attr:`MidpointIteration.gained` in all iterations.
+        gains: fill in :attr:`MidpointIteration.gained` in all iterations. routine: of :func:`step`.
     """
-    iterations, launch = list[MidpointIteration](), dyn._engine.launch_routine
-    given, reports = given | {"reports": ()}, given["reports"]
+    iterations, launch, contacts = list[MidpointIteration](), dyn._engine.launch_routine, routine is CONTACT_STEP
+    reports = {"reports": given["reports"]} if contacts else {}
+    given = given | dict.fromkeys(reports, ())
     while len(iterations) < rounds:
-        one = begin_iteration(dyn, dt, q, qd, iterations)
+        one = begin_iteration(dyn, dt, q, qd, iterations, rounds == 1)
         iterations.append(one)
         asked = {"q_out": dyn.recursions.array("q of a round", *q.shape)}
         chosen = {"qdd": True} if gains else {}
         if len(iterations) == rounds:
-            asked, given, chosen = asked | more, given | {"reports": reports}, chosen | options
+            asked, given, chosen = asked | more, given | reports, chosen | options
         asked |= {"qdd_out": one.gained} if "qdd" in chosen else {}
-        launch(CONTACT_STEP, one.found, asked, qd=qd, dt=dt, **one.step(q), **given, **chosen)
+        launch(routine, one.found, asked, qd=qd, dt=dt, **one.step(q, contacts), **given, **chosen)
     return iterations
 
 
 def begin_iteration(
-    dyn: Dynamics, dt: float, q: wp.array, qd: wp.array, iterations: list[MidpointIteration]
+    dyn: Dynamics, dt: float, q: wp.array, qd: wp.array, iterations: list[MidpointIteration], only: bool = False
 ) -> MidpointIteration:
-    """Launch the kick of the iteration that follows ``iterations``, and return it."""
+    """Launch the kick of the iteration that follows ``iterations``, and return it.
+
+    ``only``: of the one round of a step, whose kick has a shorter kernel: the rates of no iteration come before.
+    """
 
     def array(name: str, like: wp.array) -> wp.array:
         return dyn.recursions.array((name, len(iterations)), *like.shape)
@@ -181,7 +191,6 @@ def begin_iteration(
         array(PASS_ACCELERATION, qd),
     )
     more = {"q_out": one.q, f"{PATH}_out": one.path}
-    dyn._engine.launch_routine(
-        FIRST_KICK, one.kick, more, q=q, qd=qd, dt=dt, **{PREVIOUS_RATES: previous_rates, PREVIOUS_KICK: previous_kick}
-    )
+    previous = {} if only else {PREVIOUS_RATES: previous_rates, PREVIOUS_KICK: previous_kick}
+    dyn._engine.launch_routine(FIRST_KICK, one.kick, more, q=q, qd=qd, dt=dt, **previous)
     return one

@@ -40,9 +40,11 @@ class StepOptions:
         passes: of a scene with contacts, see :doc:`/contacts`; None: 3, or 4 where bodies touch each other. One is
             stable and coarse. From 4 on, where no bodies touch each other, energy hardly ever rises; that is three
             times the work of three.
-        rounds: of a scene with contacts: how often a step is repeated with velocity terms at its middle, see
-            :doc:`/contacts`. 0: never; these terms are those at the start of the step. 1: robots that tumble keep their
-            energy; about twice the work. None: 2 from 4 passes on, else 0; 0 where bodies touch each other, too.
+        rounds: how often a "semi_implicit" step is repeated with velocity terms at its middle, see :doc:`/contacts`.
+            0: never; these terms are those at the start of the step. 1: robots that tumble keep their energy; about
+            twice the work. None: with contacts 2 from 4 passes on, else 0; 0 where bodies touch each other, too. Where
+            bodies touch each other or loops are closed there is no other; without contacts such a step has no
+            gradients.
     """
 
     integrator: str = "semi_implicit"
@@ -70,8 +72,8 @@ class StepReport(Mapping[str, Any]):
               over substeps. The points are ``scene.contact_points``; after them, for each of ``scene.contact_pairs``,
               comes the force of the other body on the first one.
             * ``contact_gap``: distance of each point from the ground [world, contact] [m], negative inside, at the q
-              that the step starts from; of a pair at its deepest point, infinite where no faces meet, or, in joint space,
-              where the two are not near each other.
+              that the step starts from; of a pair at its deepest point, infinite where no faces meet, and in joint
+              space where the two are not near each other.
             * ``contact_slip``: speed of each point along the ground after the step [world, contact] [m/s]; of a pair
               that of its deepest point along the other body.
             * ``contact_excess``: what the last pass leaves [world, 3]: the largest friction force beyond its cone and

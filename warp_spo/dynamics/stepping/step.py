@@ -54,10 +54,14 @@ if TYPE_CHECKING:
     from ..gradients import Gradients
 
 
-def _pull_step(
+def _pull_back_step(
     gradients: Gradients, operation: Operation, given: dict, options: dict, results: Any, cotangents: Any, wrt: Any
 ) -> dict[str, Any]:
-    """Return gradients of a step; ``results`` are the new state and the accelerations."""
+    """Return the gradients of a step by the names ``wrt``: its Jacobian, transposed, times ``cotangents``.
+
+    Args:
+        given, options: of the step. results: q and qd after it, and its qdd. cotangents: of q and qd after it.
+    """
     dyn, engine, derivative = gradients.dyn, gradients.dyn._engine, derivative_of(operation)
     with engine.call_named("step, backwards") as call:
         arrays = {"dt": float(options["dt"]), **engine.read(call, operation, **given)}
@@ -65,7 +69,7 @@ def _pull_step(
         arrays["qdd"] = call.read("qdd", results[2], shape["qd"])
         for name, like, array in zip(("q_cotangent", "qd_cotangent"), ("q", "qd"), cotangents, strict=True):
             arrays[name] = call.read(name, array, shape[like])
-        names, outs = gradients.outs(call, operation, arrays, wrt, None)
+        names, outs = gradients.prepare_outputs(call, operation, arrays, wrt, None)
         if dyn.scene.contacts:
             arrays |= {name: options.get(name) for name in ("passes", "rounds")}
         gradients.launch(derivative, names, outs, arrays)
@@ -95,6 +99,8 @@ def _without_gradient(dyn: Dynamics, arguments: dict[str, Any]) -> str:
         return "qdd is given; expected no qdd=, which the way back uses itself"
     if arguments.pop("actuator_state", None) is not None and actuators.delays_controls(dyn):
         return "actuators delay ctrl; expected a scene without delays, whose buffers have no gradients"
+    if arguments.get("rounds") and not dyn.scene.contacts:
+        return f"rounds is {arguments['rounds']} without contacts; expected rounds=None, which has gradients"
     for name in ("status", *integrators.BODIES, *contact_options.REPORTS):
         if arguments.get(name) is not None and arguments.get("substeps", 1) != 1:
             return f"{name} is given with substeps; expected one of the two"
@@ -150,7 +156,7 @@ STEP = Operation(
         embed=Routine("embedded_step_vjp", embedded_adjoints.step_vjp),
         multipliers=EMBEDDED_DERIVATIVE,
         keeps=("qdd",),
-        pull=_pull_step,
+        pull=_pull_back_step,
         launch=_launch_gradients,
         refuses=_without_gradient,
         repeats=_take_substeps,
@@ -192,35 +198,36 @@ def _step(
     with engine.call(STEP) as call:
         integrators.check_integrator(call, integrator, status=status, qdd=qdd)
         outs = engine.outs(call, STEP, out)
-        count = _take_substeps(call.name, {"substeps": substeps})
+        substep_count = _take_substeps(call.name, {"substeps": substeps})
         reported = contact_f, contact_gap, contact_slip, contact_excess, contact_moment, contact_residual
-        asked = dict(zip(contact_options.REPORTS, reported, strict=True))
-        taken = contact_options.check_step(self, call, integrator, passes, asked)
+        report_arrays = dict(zip(contact_options.REPORTS, reported, strict=True))
+        passes_made = contact_options.check_step(self, call, integrator, passes, report_arrays)
         actuators.check_commands(self, call, ctrl, actuator_state, target_q)
         forces = {"tau": tau, "body_f": body_f, "target_q": target_q, "target_qd": target_qd, "ctrl": ctrl}
-        written = {} if integrator != "semi_implicit" else {"qdd": qdd, "status": status}
-        given = engine.read(call, STEP, q=q, qd=qd, dt=dt, **forces, **written)
+        to_write = {} if integrator != "semi_implicit" else {"qdd": qdd, "status": status}
+        given = engine.read(call, STEP, q=q, qd=qd, dt=dt, **forces, **to_write)
         if not given["dt"] > 0.0:
             raise ValueError(f"{call.name}: dt is {given['dt']} s; expected more than zero")
         buffers = actuators.read_state(self, call, actuator_state)
         states = _read_if_given(self, call, {"poses": poses, "velocities": velocities})
-        reports = _read_if_given(self, call, asked)
-        made = contact_options.check_rounds(self, call, rounds)
-        given |= {} if taken is None else {"passes": taken, "rounds": made, "reports": reports}
+        reports = _read_if_given(self, call, report_arrays)
+        rounds_made = contact_options.check_rounds(self, call, integrator, rounds)
+        given |= {"rounds": rounds_made} if passes_made is not None or rounds_made else {}
+        given |= {} if passes_made is None else {"passes": passes_made, "reports": reports}
         given["bodies"] = integrators.arrays_of_bodies(self, states) if states else None
         q_out, qd_out = engine.write(call, STEP, outs, given)
         interval = StepArrays(given["q"], given["qd"], q_out, qd_out, given["dt"])
         given = {name: value for name, value in given.items() if name not in StepArrays._fields}
-        words, found = given.get("status"), {"qdd": given.get("qdd"), **states, **reports}
-        if words is not None:
+        status_array, found = given.get("status"), {"qdd": given.get("qdd"), **states, **reports}
+        if status_array is not None:
             interval = interval._replace(q=_apart(self, interval))
-        _launch(self, call, integrator, count, interval, given, buffers)
-        if words is not None:
+        _launch(self, call, integrator, substep_count, interval, given, buffers)
+        if status_array is not None:
             found = {name.removeprefix("contact_"): array for name, array in found.items()}
             found = {"force" if name == "f" else name: array for name, array in found.items() if name != "moment"}
-            word = Status.LOOPS if self.closed and self.embedding is None else Status.RANGE
+            reason = Status.LOOPS if self.closed and self.embedding is None else Status.RANGE
             kinds, after = self._coordinate_kinds, {"q_after": q_out, "rates": qd_out}
-            status_words.check_results(self.recursions, kinds, interval.q, words, word, **after, **found)
+            status_words.check_results(self.recursions, kinds, interval.q, status_array, reason, **after, **found)
     return call.result
 
 
@@ -331,7 +338,7 @@ def _launch(
     if force is not None:
         given["reports"]["contact_f"] = dyn.recursions.array("contact force", *force.shape)
     for substep in range(count):
-        now = ctrl if ctrl is None or buffers is None else actuators.delayed(dyn, ctrl, buffers)
+        now = ctrl if ctrl is None or buffers is None else actuators.advance_delays(dyn, ctrl, buffers)
         if substep and status is not None:
             given["status"] = dyn._later_status
         INTEGRATORS[integrator](dyn, call, interval, **given, **(of_last if substep == count - 1 else {}), ctrl=now)

@@ -83,7 +83,7 @@ class Guard:
         self.apart: list[str] = []
 
     def check(self, cause: str, values: Any) -> Check:
-        """Look at numbers."""
+        """Return whether all numbers are within the bound of a cause, and the code of what ends the world if not."""
         code = 1.0 + [*self.limits].index(cause)
         finite = within(values, LARGEST)
         return Check(within(values, self.limits[cause]), where(finite, code + len(self.limits), code))
@@ -94,7 +94,7 @@ class Guard:
         return vector(where(checks[-1].fine, x, 0.0) for x in values)
 
     def check_state(self, w: World) -> list[Check]:
-        """Look at the state after a step of the dynamics."""
+        """Return the checks of the state after a step of the dynamics."""
         parts = {"state/coordinates": w.q, "state/speeds": w.qd}
         if "state/accelerations" in self.limits:
             parts["state/accelerations"] = w.read("qdd", w.scene.dof_count)
@@ -160,6 +160,6 @@ class Guard:
         return self.places.setdefault(name, len(self.places))
 
     def ends(self, code: Any) -> dict[str, Condition]:
-        """Return the ends that belong to a code."""
+        """Return, by kind of fault, whether a code is one of that kind."""
         count = len(self.limits) + 0.5
         return {NOT_FINITE: (code > 0.5) & (code < count), BEYOND: code > count}

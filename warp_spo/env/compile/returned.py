@@ -95,6 +95,11 @@ def commands_drawn(commands: Any, w: World, done: Any) -> dict[str, Vector]:
     return {name: numbers(f"commands.draw returned as {name!r}", x, sizes.get(name)) for name, x in drawn.items()}
 
 
+def command_updated(commands: Any, w: World, command: Vector) -> Vector:
+    """Return the command after an update; errors as :func:`numbers`."""
+    return numbers("commands.update returned", commands.update(w, command), commands.size)
+
+
 def controls(part: Any, w: World, action: Vector, sizes: dict[str, int]) -> list[tuple[int, Any]]:
     """Return (entry, number) of what a part of the actions sets in its array, which has so many entries.
 

@@ -26,7 +26,7 @@ from .buffers import FAULT
 from .fused_kernel import FusedKernel
 from .guard import BEYOND, LARGEST, NOT_FINITE, Check, first, within
 from .memory_layout import MemoryLayout
-from .returned import check_event, check_force, commands_drawn, condition, controls, one_number
+from .returned import check_event, check_force, command_updated, commands_drawn, condition, controls, one_number
 from .vectors import Vector, as_value, vector
 
 CHOSEN_WORLD = "chosen.data[world]"  # C++: the world has just started anew
@@ -287,9 +287,9 @@ class Tracing:
             w.keep_own(name, values)
         w.keep_own("until command", found[-1:])
         later.forgets = True
-        given, updated = w.kept[COMMAND], self.commands.update(later, w.kept[COMMAND])
+        given, updated = w.kept[COMMAND], command_updated(self.commands, later, w.kept[COMMAND])
         later.starts = None
-        news = updated if intervals else [where(done, a, b) for a, b in zip(updated, given, strict=True)]
+        news = list(updated) if intervals else [where(done, a, b) for a, b in zip(updated, given, strict=True)]
         held, before = w.memory(HELD, len(given), reset=None), w.stored_memory(COMMAND)
         w.keep_own(COMMAND, [where(mark > 0.5, old, new) for mark, old, new in zip(held, before, news, strict=True)])
 

@@ -163,16 +163,16 @@ def _read(graph: Graph) -> TraversalFrame:
 
 
 def _frame_of_child(
-    over: TraversalFrame, link: Link, q: Callable[[int], Value], qd: Callable[[int], Value]
+    parent: TraversalFrame, link: Link, q: Callable[[int], Value], qd: Callable[[int], Value]
 ) -> TraversalFrame:
     """Return the frame of a link for that of its parent, at q and qd."""
     place = place_link(link, q)
-    arm, Q = turned(over.Q, place.pose.l), multiply(over.Q, relative_quaternion(link, q))
-    w, v = over.w, over.v + cross(over.w, arm)
-    columns = link.hinge.inertial_columns(link, place, _axes(over.Q), _axes(Q), ZERO)
+    arm, Q = turned(parent.Q, place.pose.l), multiply(parent.Q, relative_quaternion(link, q))
+    w, v = parent.w, parent.v + cross(parent.w, arm)
+    columns = link.hinge.inertial_columns(link, place, _axes(parent.Q), _axes(Q), ZERO)
     for dof, (turn, shift) in zip(link.dofs, columns, strict=True):
         w, v = w + turn * qd(dof), v + shift * qd(dof)
-    return TraversalFrame(over.p + arm, Q, w, v)
+    return TraversalFrame(parent.p + arm, Q, w, v)
 
 
 def _axes(Q: Quaternion) -> Matrix:

@@ -17,7 +17,7 @@ from .shared_code import SharedCode
 def build(builder: Builder, job: Job, links: Links) -> Program | None:
     """Return the program of a job that stores the states of bodies; None if there is no room for them."""
     traversals, dtype = _assign_to_warps(body_frames.traversals(links)), builder.dtype
-    stores = {step: _stores(links, job, *step) for step in sorted({step for each in traversals for step in each})}
+    stores = {step: _step_stores(links, job, *step) for step in sorted({step for each in traversals for step in each})}
     everything = [item for some in stores.values() for item in some]
     whole = [item for item in everything if item.array == "out"]
     layout = builder.layout(job, whole, everything, warps=len(traversals))
@@ -53,8 +53,8 @@ def _assign_to_warps(traversals: list[list]) -> list[list]:
     return found
 
 
-def _stores(links: Links, job: Job, moves: bool, number: int) -> list[Store]:
-    """Return the stores of a step."""
+def _step_stores(links: Links, job: Job, moves: bool, number: int) -> list[Store]:
+    """Return the stores of a step of a traversal: to link ``number``, or of the state of body ``number``."""
     if moves:
         return body_frames.move_to_link(links, number)
     return [

@@ -90,7 +90,17 @@ def build(builder: Builder, job: Job, segments: Segments, alone: bool = False, l
 
 
 class _SegmentProgram:
-    """The work of segments on a job; arguments as of :func:`build`."""
+    """Generates the program of a routine in which segments share the work, a warp each; see :func:`build`.
+
+    Args:
+        builder: the parts that all programs share. job: the routine, and the arrays and options that it is built for.
+        segments: of the scene. alone: one thread takes all segments, one after the other.
+        local: that thread keeps their messages in its own memory, where warps use shared memory.
+
+    Attributes:
+        letters: of the messages that are sent, see :mod:`~warp_spo.recursions.model.messages`.
+        offsets: where each message begins. sent: how many scalars all messages have, with those of couples of bodies.
+    """
 
     def __init__(self, builder: Builder, job: Job, segments: Segments, alone: bool, local: bool):
         self.builder, self.job, self.segments, self.alone, self.local = builder, job, segments, alone, local
@@ -98,16 +108,16 @@ class _SegmentProgram:
         self.schedule = Schedule(segments)
         assert job.routine.segments is not None
         self.form = job.routine.segments
-        self.letters = messages.needed(self.form.messages, job.shapes)
+        self.letters = messages.select_sent(self.form.messages, job.shapes)
         self.offsets, self.sent = messages.offsets(self.letters, segments)
         self.couples = self._couples() if self.form.couples_bodies else None
         self.sent = self.couples.layout["end"] if self.couples is not None else self.sent
-        self.unfolds = not self.form.couples_bodies  # constants in which segments differ may be kept from folding
+        self.may_keep_constants = not self.form.couples_bodies  # from folding, those in which segments differ
 
     def build(self) -> Program | None:
         """Return the program; of two, with constants that fold and with some that do not, that with fewer texts."""
         found = self._gather([frozenset()] * len(self.segments.all))
-        if found is not None and self.unfolds:
+        if found is not None and self.may_keep_constants:
             unfolded = shared_constants.find_differing(self.segments.all, found.constants, found.kernel.texts)
             other = self._gather(unfolded) if any(unfolded) else None
             if other is not None and len(set(other.kernel.texts)) < len(set(found.kernel.texts)):
@@ -127,11 +137,11 @@ class _SegmentProgram:
         """Return what the work on a segment stores; the constants ``unfolded`` do not fold, see
         :mod:`.shared_constants`."""
         shapes, options = self.job.shapes, self.job.options
-        links = self.builder.own_links(options, self.unfolds)  # its own: equal segments then give equal text
+        links = self.builder.own_links(options, self.may_keep_constants)  # its own: equal segments then give equal text
         exchange = SegmentExchange(links, index, self.offsets, self.segments.distinct_dof_count > MOST_LAWS)
         trace = Trace(links, self.dtype, tuple(shapes), exchange)
         trace.team = self.couples
-        if self.unfolds:
+        if self.may_keep_constants:
             points = [number for number, _ in own_points(trace)]
             links.shared_constants = shared_constants.SharedConstants(links.graph, exchange.segment, points, unfolded)
 
@@ -146,7 +156,10 @@ class _SegmentProgram:
             final_stores=[flat(group) for group in phases.final_stores],
         )
         found = SegmentTrace(
-            phases, trace.couples, trace.kept_between_sweeps, links.shared_constants if self.unfolds else None
+            phases,
+            trace.couples,
+            trace.kept_between_sweeps,
+            links.shared_constants if self.may_keep_constants else None,
         )
         used = _read(phases.pass_invariants, found.everything[len(phases.prologue) :])
         return found._replace(phases=phases._replace(pass_invariants=used))
@@ -157,11 +170,11 @@ class _SegmentProgram:
         routine = job.routine
         traced = [self._trace(index, unfolded[index]) for index in range(len(segments.all))]
         everything = [item for one in traced for item in one.everything]
-        bends = any(item.array == MISSED for item in everything)
-        if not (bends or routine.is_counted):
+        guesses = any(item.array == MISSED for item in everything)
+        if not (guesses or routine.is_counted):
             traced = [one._replace(phases=one.phases._replace(pass_invariants=[])) for one in traced]
-        passes = self._passes(traced, bends)
-        sent = self.sent + (2 * schedule.warps if bends else 0)
+        passes = self._make_pass_loop(traced, guesses)
+        sent = self.sent + (2 * schedule.warps if guesses else 0)
         whole = [item for item in everything if item.array == "out"]
         warps = 1 if self.alone else schedule.warps
         layout = self.builder.layout(job, whole, everything, 0 if self.local else sent, warps)
@@ -178,8 +191,12 @@ class _SegmentProgram:
         constants = [one.constants for one in traced if one.constants is not None]
         return SegmentsCode(kernel, layout, table, sent, looks_up, self.couples, constants)
 
-    def _passes(self, traced: list[SegmentTrace], bends: bool) -> PassLoop | None:
-        """Return how the work is repeated; ``bends``: guesses of a pass may turn out wrong."""
+    def _make_pass_loop(self, traced: list[SegmentTrace], guesses: bool) -> PassLoop | None:
+        """Return the loop over passes and what each segment keeps from pass to pass; None where there are no passes.
+
+        An argument of the kernel counts the passes, or they go on while a pass shows that its guesses were wrong;
+        ``guesses``: some segment has any.
+        """
         sizes = {index: len(one.phases.pass_invariants) for index, one in enumerate(traced)}
         if self.job.routine.is_counted:
             counts = [sum(item.array == SECANT for item in one.phases.prologue) for one in traced]
@@ -187,7 +204,7 @@ class _SegmentProgram:
         if self.job.routine.passes is None:
             return None
         kept = (GUESS, GAIN, FORCE, RESISTANCE) if any(one.phases.laws for one in traced) else (GUESS, GAIN)
-        return PassLoop(kept, self.sent if bends else None, sizes)
+        return PassLoop(kept, self.sent if guesses else None, sizes)
 
     def _fits(self, layout: KernelLayout) -> bool:
         """Whether shared memory has room for the result, for messages of segments, and for the states of bodies.

@@ -14,7 +14,7 @@ from ...scene.ground import AWAY, HeightField
 from ...scene.supports import CAPSULE_GRID, CYLINDER_GRID, GRIDS
 from ...trace.scalars import Graph, Scalar, Value, floor, inverse_root, is_constant, less, reciprocal, search, select
 from ...trace.spatial import Vector, dot, total
-from .ground import GROUND, Corners, GroundOffset, Surface, clamp, facing
+from .ground import GROUND, Corners, GroundOffset, Surface, clamp, upward_normal
 
 QUADRANTS, ROW = 4, 9  # rows of a search, and numbers of a row
 NONE, POINT, LINE_Y, FACE = 0.5, 1.5, 2.5, 3.5  # below which a row's kind is none, a point, a line along y, a face's
@@ -105,7 +105,7 @@ def _under_face(
     across, aside = (select(along_y, out[0], out[1]), select(along_y, out[1], out[0]))
     inverse = reciprocal(select(is_point, 1.0, across))
     slope, t = (out[2] - aside * rise) * inverse, crossed * inverse
-    normal = facing(select(along_y, slope, rise), select(along_y, rise, slope))
+    normal = upward_normal(select(along_y, slope, rise), select(along_y, rise, slope))
     height = below[2] + (t * aside - beside) * rise - t * out[2]
     normal, under = (
         Vector(select(is_point, a, b) for a, b in zip(*pair, strict=True))

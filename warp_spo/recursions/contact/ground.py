@@ -88,7 +88,7 @@ def surfaces(
     edges = Edges.of(x, y, rows, columns)
     cell = read.levelled(edges)
     height = cell.base + cell.run * s + cell.rise * t + cell.twist * (s * t)
-    smooth = facing((cell.run + cell.twist * t) * rate_x, (cell.rise + cell.twist * s) * rate_y)
+    smooth = upward_normal((cell.run + cell.twist * t) * rate_x, (cell.rise + cell.twist * s) * rate_y)
     steep_somewhere = has_walls(ground, place.varies)
     if not (walls and steep_somewhere):
         return [Surface(smooth, (height - z) * smooth[2], read, 1.0 if steep_somewhere else None)]
@@ -103,7 +103,7 @@ def surfaces(
     cell = read.levelled(Edges(*(select(steep, a, b) for a, b in zip(edges, then, strict=True))))
     s, t = (i + s) - select(steep, i, next_i), (j + t) - select(steep, j, next_j)
     run, rise = cell.run + 0.5 * cell.twist, cell.rise + 0.5 * cell.twist
-    wall = facing(run * rate_x, rise * rate_y)
+    wall = upward_normal(run * rate_x, rise * rate_y)
     middle = cell.mean + run * (s - 0.5) + rise * (t - 0.5)
     rises = select(steep, 1.0, less(0.0, run * rate_x * moves[0] + rise * rate_y * moves[1]))
     there = rises * less(STEEP * STEEP, cell.steepness(rate_x, rate_y)) * (1.0 - less(cell.highest, z))
@@ -117,7 +117,7 @@ def upward(graph: Graph, ground: HeightField, at: list[Value], place: GroundOffs
     x, y = (at[0] - place.origin[0] - ground.origin[0]) * rate_x, (at[1] - place.origin[1] - ground.origin[1]) * rate_y
     (i, s), (j, t) = _cell(x, rows), _cell(y, columns)
     cell = Corners.of(graph, ground, place, i, j).levelled(Edges.of(x, y, rows, columns))
-    smooth = facing((cell.run + cell.twist * t) * rate_x, (cell.rise + cell.twist * s) * rate_y)
+    smooth = upward_normal((cell.run + cell.twist * t) * rate_x, (cell.rise + cell.twist * s) * rate_y)
     steep = less(STEEP * STEEP, cell.steepness(rate_x, rate_y))
     return Vector(select(steep, a, b) for a, b in zip(IDENTITY[2], smooth, strict=True))
 
@@ -267,7 +267,7 @@ def clamp(x: Value, most: float, least: float = 0.0) -> Value:
     return select(less(x, most), x, most)
 
 
-def facing(slope_x: Value, slope_y: Value) -> Vector:
+def upward_normal(slope_x: Value, slope_y: Value) -> Vector:
     """Return the upward unit normal of a surface with these slopes."""
     size = inverse_root(slope_x * slope_x + slope_y * slope_y + 1.0)
     return Vector((-(slope_x * size), -(slope_y * size), size))

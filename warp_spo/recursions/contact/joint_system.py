@@ -12,20 +12,26 @@ from typing import TYPE_CHECKING
 
 from ...trace.emission import Store
 from ...trace.scalars import Value, is_constant, sqrt
-from ...trace.spatial import ZERO, Vector, dot, total
-from ..kinematics import zero
+from ...trace.spatial import IDENTITY, ZERO, Vector, dot, total
+from ..kinematics import columns, zero
 from ..newton_euler import inverse_dynamics
 from ..step.actuation import build_joint_laws
-from ..step.joint_laws import JointLaws
+from ..step.joint_laws import JointLaws, Law, add_laws
 from .pairs import place_axes_of
 from .points import place_points, with_ancestors
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace
 
-SURFACES, OF_DOFS, OF_PAIRS = "surfaces", "dof_values", "pair_values"
+SCREWS, SURFACES, OF_MOTORS = "screws", "surfaces", "motors"
+OF_DOFS, OF_PAIRS = "dof_values", "pair_values"
+SCREW = 9  # entries of a dof: what its rate turns, and moves of the place whose coordinates follow, inertial axes
 SURFACE = 11
 """Entries of a surface: place, normal, depth; push and damping of its law; gap; 1 where the point comes out slowly."""
+LAW = 5
+"""Entries of a law f(u) = scale clip(force - resistance u, least, most) of OF_MOTORS: force, resistance, least, most,
+scale; UNBOUNDED where there is no bound."""
+UNBOUNDED = 1e30
 AWAY = -1e3  # depth of a point that cannot move [m]
 LAWS = {
     "stiffness": "joint_stiffness", "damping": "joint_damping", "ke": "joint_target_ke", "kd": "joint_target_kd",
@@ -41,17 +47,30 @@ OTHERS = (
 
 
 def joint_system(
-    trace: Trace, surfaces: bool, pairs: tuple[int, ...], names: tuple[tuple[str, ...], tuple[str, ...]] | None = None
+    trace: Trace,
+    surfaces: bool,
+    pairs: tuple[int, ...],
+    motors: tuple[int, ...],
+    names: tuple[tuple[str, ...], tuple[str, ...]] | None = None,
 ) -> list[Store]:
-    """out = bias force, with gravity compensation; SURFACES; OF_DOFS and OF_PAIRS, those that are no constants
+    """out = bias force, with gravity compensation; SCREWS; SURFACES; OF_MOTORS; OF_DOFS, OF_PAIRS that are no constants
 
     ``surfaces``: whether points may touch the ground. ``names``: of the values of dofs, and of pairs; None: all are
-    constants. ``pairs``: the order of the scene's pairs, after which the surfaces follow.
+    constants. ``pairs``: the order of the scene's pairs, after which the surfaces follow. ``motors``: by dof, how many
+    laws of its spring, drive and actuators OF_MOTORS has.
     """
     trace.compensate_gravity()
     laws = build_joint_laws(trace, trace.graph.input("dt", 0))
     stores = list(inverse_dynamics(trace, qdd=zero, letter="f"))
-    numbers = _add_surfaces(trace, laws, stores) if surfaces else []
+    place_axes_of(trace, list(trace.links.links))
+    origins: dict[int | None, Vector] = {None: ZERO}
+    for link in trace.active_links:
+        trace.label(link, "y")
+        own, over = trace.places[id(link)].pose.l, link.parent
+        origins[id(link)] = own if over is None else origins[id(over)] + trace.axes[id(over)] @ own
+    stores += _screws(trace, origins)
+    numbers = _add_surfaces(trace, laws, origins, stores) if surfaces else []
+    stores += _motor_laws(trace, laws, motors)
     if names is not None:
         first = len(trace.links.scene.contact_points)
         rows = [*(first + pair for pair in pairs), *numbers]
@@ -59,18 +78,25 @@ def joint_system(
     return stores
 
 
-def _add_surfaces(trace: Trace, laws: JointLaws, stores: list[Store]) -> list[int]:
+def _screws(trace: Trace, origins: dict[int | None, Vector]) -> list[Store]:
+    """Return the stores of the motion of each dof, of the links that carry bodies."""
+    found: list[Store] = []
+    carriers = with_ancestors([placement.link for placement in trace.links.placements.values()])
+    for link in trace.active_links:
+        if id(link) not in carriers:
+            continue
+        trace.label(link, "j")
+        parent = IDENTITY if link.parent is None else trace.axes[id(link.parent)]
+        for dof, (w, v) in zip(
+            link.dofs, columns(link, trace.places[id(link)], parent, trace.axes[id(link)], ZERO), strict=True
+        ):
+            found += [Store(SCREWS, (SCREW * dof + c,), x) for c, x in enumerate((*w, *v, *origins[id(link)]))]
+    return found
+
+
+def _add_surfaces(trace: Trace, laws: JointLaws, origins: dict[int | None, Vector], stores: list[Store]) -> list[int]:
     """Add the stores of the surfaces; return the number of the point of each."""
     points = place_points(trace, laws, trace.vector("qd"), oriented=True)
-    links = [point.link for point in points]
-    place_axes_of(trace, links)
-    origins: dict[int | None, Vector] = {None: ZERO}
-    needed = with_ancestors(links)
-    for link in trace.active_links:
-        if id(link) in needed:
-            trace.label(link, "y")
-            own, over = trace.places[id(link)].pose.l, link.parent
-            origins[id(link)] = own if over is None else origins[id(over)] + trace.axes[id(over)] @ own
     for at, point in enumerate(points):
         trace.graph.step = f"contact {point.number}|y"
         still = point.link is None
@@ -81,6 +107,26 @@ def _add_surfaces(trace: Trace, laws: JointLaws, stores: list[Store]) -> list[in
         row = [*place, *normal, *law, point.gap, 0.0 if still else point.deep]
         stores += [Store(SURFACES, (SURFACE * at + i,), value) for i, value in enumerate(row)]
     return [point.number for point in points]
+
+
+def _motor_laws(trace: Trace, laws: JointLaws, motors: tuple[int, ...]) -> list[Store]:
+    found: list[Store] = []
+    for link in trace.active_links:
+        for i, dof in enumerate(link.dofs):
+            if not motors[dof]:
+                continue
+            trace.label(link, "m")
+            every = laws.springs_and_motors(link, i)
+            loose = [law for law in every if not law.has_bounds]
+            rows = [add_laws(loose)] * bool(loose) + [law for law in every if law.has_bounds]
+            assert len(rows) <= motors[dof]
+            rows += [Law(0.0, 0.0)] * (motors[dof] - len(rows))
+            for at, law in enumerate(rows, start=sum(motors[:dof])):
+                least = -UNBOUNDED if law.least is None else law.least
+                most = UNBOUNDED if law.most is None else law.most
+                values = (law.force, law.resistance, least, most, law.scale)
+                found += [Store(OF_MOTORS, (LAW * at + c,), value) for c, value in enumerate(values)]
+    return found
 
 
 def _dof_values(trace: Trace, laws: JointLaws, names: tuple[str, ...]) -> list[Store]:

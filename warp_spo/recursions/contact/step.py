@@ -32,7 +32,6 @@ from .law import PointReport, PointResult, PointState, begin_point, finish_point
 from .points import TracedContactPoint, ground_offset, keeps_arms, own_points, place_points
 from .secant_laws import PassVariables, SecantLaw, largest, single_dofs
 from .turning import moment_at, turning_names
-from .velocity_kicks import KICK, START
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace
@@ -53,20 +52,13 @@ class ContactStepTrace(Step):
         trace: the evaluation. reports: names among REPORTS of what the step stores beside the state.
 
     Attributes:
-        has_kicks: velocity terms are kicks before and after the step, see :mod:`.velocity_kicks`; ``qd`` is after the
-            first one, and all but the hinges' laws is at the midpoint; qdd is what the passes find, without kicks.
         culls: whether passes skip the points of a link that cannot reach the ground, see :mod:`.contact_culling`.
     """
 
     culls = True
 
     def __init__(self, trace: Trace, reports: tuple[str, ...]):
-        self.has_kicks, before, self.kick = KICK in trace.inputs, trace.vector("qd"), trace.vector(KICK)
-        if self.has_kicks:
-            trace.substitutes = {"q": trace.vector(START), "qd": lambda dof: before(dof) + self.kick(dof)}
         super().__init__(trace)
-        trace.substitutes.pop("q", None)  # the sweep is at the midpoint, its laws are not
-        self.carries = not self.has_kicks
         self.reports, self.pass_variables = reports, PassVariables(trace.graph)
         self.secant_laws: dict[int, list[SecantLaw]] = {}  # by dof
         self.cull_groups: dict[int, CullGroup] = {}  # by id of the link

@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from ..model.tracing import Trace
 
 KICK, PREVIOUS_RATES, PREVIOUS_KICK = "kick", "found", "kick_before"
-"""Arrays [world, dof]: k; qd' and k of the previous iteration, which are qd and zero in the first one."""
+"""Arrays [world, dof]: k; qd' and k of the previous iteration, which are qd and zero in the first one. Without these
+two a kick is that of the first iteration, in which no rates are across the path."""
 START, PATH = "q_before", "path"
 """Arrays: q before the step, where "q" is at the midpoint [world, coordinate]; u, the path [world, dof]."""
 
@@ -80,9 +81,10 @@ def _kick(trace: Trace) -> tuple[dict[int, Value], dict[int, Value], Callable[[L
     """Return by dof k of the trace's links and u, the coordinates half way by link, and stores of messages."""
     (qd, previous_rates, previous_kick), h = _rates_and_kicks(trace), trace.graph.input("dt", 0)
     start, dofs = trace.vector("q"), [dof for link in trace.links.leaders for dof in link.dofs]
-    u = {dof: previous_rates(dof) - previous_kick(dof) for dof in dofs}
-    v = {dof: 0.5 * (qd(dof) + previous_rates(dof)) for dof in dofs}
-    a, b = ({dof: 0.5 * (u[dof] + sign * v[dof]) for dof in dofs} for sign in (1.0, -1.0))
+    begins = PREVIOUS_RATES not in trace.inputs
+    u = {dof: qd(dof) if begins else previous_rates(dof) - previous_kick(dof) for dof in dofs}
+    v = u if begins else {dof: 0.5 * (qd(dof) + previous_rates(dof)) for dof in dofs}
+    a, b = ({dof: u[dof] if begins else 0.5 * (u[dof] + sign * v[dof]) for dof in dofs} for sign in (1.0, -1.0))
 
     def half(link: Link) -> dict[int, Value]:
         trace.label(link, "q")
@@ -90,8 +92,8 @@ def _kick(trace: Trace) -> tuple[dict[int, Value], dict[int, Value], Callable[[L
 
     there = {at: x for link in trace.links.leaders for at, x in half(link).items()}
     trace.substitutes = {"q": there.__getitem__, "qd": b.__getitem__}
-    across = inverse_dynamics(trace, gravity=False, qdd=zero, letter="f")
-    forces = {item.index[0]: item.value for item in across if item.array == "out"}
+    across = [] if begins else inverse_dynamics(trace, gravity=False, qdd=zero, letter="f")
+    forces = dict.fromkeys(dofs, 0.0) | {item.index[0]: item.value for item in across if item.array == "out"}
     trace.substitutes["qd"] = a.__getitem__
     done, rates, sent = reduce(trace, forces.__getitem__, moves=True, loads=False)
     along = expand(trace, done, rates, (ZERO, ZERO))

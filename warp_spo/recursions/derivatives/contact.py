@@ -266,7 +266,7 @@ class PassGradient(PassAdjoint):
         return place_points(self.trace, self.joint_laws, self.qd, carry=self._carry)
 
     def _carry(self, link: Link, own: ContactLinkMotion) -> ContactLinkMotion:
-        """Return what further links know of a link."""
+        """Return the motion of a link as links further out read it: cut from its history where another part has it."""
         travels = own.travel if self.has_kicks else ()
         known = [x for row in (*own.axes, own.origins, *own.twist, *own.bend, *travels) for x in row]
         if link is self._end:

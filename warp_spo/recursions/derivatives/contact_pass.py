@@ -61,7 +61,7 @@ class OnePass(ContactStepTrace):
     """One pass of a step with contacts, which reads what the pass before left.
 
     Args:
-        laws: how many variables the laws of each link have, see :func:`count_laws`; None: they are counted.
+        laws: how many variables the laws of each link have, see :func:`count_law_variables`; None: they are counted.
 
     Attributes:
         before: qdd of each dof in the pass before, zero before the first one. active: the laws of each dof, added up.
@@ -84,7 +84,7 @@ class OnePass(ContactStepTrace):
         self.active: dict[int, Law] = {}
         dofs = sorted(dof for link in self.links for dof in link.dofs)
         self.before = {dof: cut(select(self.pass_variables.first, 0.0, trace.graph.input(BEFORE, dof))) for dof in dofs}
-        self.counted = tuple(self._count_laws(link) for link in self.links)
+        self.counted = tuple(self._add_law_variables(link) for link in self.links)
 
     @functools.cached_property
     def weighed(self) -> tuple[int, ...]:
@@ -103,12 +103,15 @@ class OnePass(ContactStepTrace):
             return False
         return any(law.has_bounds and law.role != LIMIT for laws in self.joint_laws.laws(link) for law in laws)
 
-    def _count_laws(self, link: Link) -> int:
-        """Make the variables of the laws of a link; return how many they are."""
-        known = len(self.pass_variables.variables)
-        self.pass_variables.places = itertools.count(self._starts.get(id(link), known))
+    def _add_law_variables(self, link: Link) -> int:
+        """Trace the laws of a link for the variables that they leave in the row; return how many these are.
+
+        They lie from the link's place on where other links' numbers are known, else behind those that are there.
+        """
+        before = len(self.pass_variables.variables)
+        self.pass_variables.places = itertools.count(self._starts.get(id(link), before))
         self._active_pieces(link)
-        return len(self.pass_variables.variables) - known
+        return len(self.pass_variables.variables) - before
 
     def _pass_variable(self, name: str, dof: int) -> Value:
         return self.h * self.before[dof] if name == GAIN else super()._pass_variable(name, dof)
@@ -146,13 +149,13 @@ def contact_pass(trace: Trace, laws: tuple[int, ...]) -> list[Store]:
     return OnePass(trace, laws).forward()
 
 
-def count_laws(trace: Trace) -> tuple[int, ...]:
+def count_law_variables(trace: Trace) -> tuple[int, ...]:
     """Return how many variables the laws of each link have in a pass."""
     return OnePass(trace, None).counted
 
 
 def weighed_segments(trace: Trace) -> tuple[int, ...]:
-    """Return :attr:`OnePass.weighed`."""
+    """Return the numbers of the segments that send inertias to the gradients, see :attr:`OnePass.weighed`."""
     return OnePass(trace, None).weighed
 
 

@@ -131,7 +131,7 @@ def of_body(inertia: Rigid | None, motion: VelocityTerms) -> CarriedSums:
 
 
 def under_load(moment_arm: Vector, force: Vector, torque: Vector) -> CarriedSums:
-    """A wrench on a body."""
+    """The sums of a force and a torque on a body, ``moment_arm`` from its link's origin to where the force acts."""
     return EMPTY._replace(load=_lever(moment_arm, force) - skew(torque), pull=force)
 
 

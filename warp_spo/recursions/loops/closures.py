@@ -158,14 +158,14 @@ class Closure:
         return [sliding] * len(self.slides) + [turning] * (self.rows - len(self.slides))
 
     def sums_of_squares(self, places: dict[int, LinkPlacement]) -> tuple[Value, Value]:
-        """Return those of the velocities and of the angular velocities, over unit rates of all dofs."""
+        """Return the sums of squares of velocities [m^2], and of angular velocities, over unit rates of all dofs."""
         _, outer = self._anchors(places)
         turning, sliding = 0.0, 0.0
         for _, w, v, _ in self._columns(places, outer):
             turning, sliding = turning + dot(w, w), sliding + dot(v, v)
         return sliding, turning
 
-    def distances(self, places: dict[int, LinkPlacement]) -> Value:
+    def squared_distances(self, places: dict[int, LinkPlacement]) -> Value:
         """Return the sum of squares of the distances that cancel where no velocity moves the joint."""
         inner, outer = self._anchors(places)
         arms = [arm for _, _, _, arm in self._columns(places, outer)]
@@ -316,19 +316,26 @@ def closures(links: Links) -> list[Closure | CouplingConstraint]:
 
 @cached_by_scene
 def _fixed_sizes(scene: Scene) -> list[FixedSizes]:
-    """Return the fixed sizes of each loop joint; a size is rounding if it is in several configurations."""
+    """Return what takes the place of the :meth:`Closure.sizes` of each loop joint that are rounding, None for others.
+
+    A sum of squares of velocities [m^2] is rounding where it is below VANISHES times the squared distances that cancel
+    in it, and one of angular velocities where it is below VANISHES, in each of a few random configurations.
+    """
     links, rng = Links(one_world(scene)), np.random.default_rng(0)
     joints, sums = [Closure(links, loop) for loop in scene.loops], []
     places = {id(link): place_link(link, lambda c: links.graph.input("q", c)) for link in links.links}
-    values = [x for joint in joints for x in (*joint.sums_of_squares(places), joint.distances(places))]
+    values = [x for joint in joints for x in (*joint.sums_of_squares(places), joint.squared_distances(places))]
     for _ in range(3):
         q = scene.neutral_q + rng.uniform(-1.0, 1.0, len(scene.neutral_q))
         found = evaluate(values, lambda _, index, q=q: q[index[0]])  # type: ignore[misc]
         sums.append(np.array(found, dtype=float).reshape(-1, 3))
-    sliding, turning, distances = np.max(sums, axis=0).T if joints else np.zeros((3, 0))
+    of_velocities, of_angular, squared_distances = np.max(sums, axis=0).T if joints else np.zeros((3, 0))
     return [
-        (float(far) if slide <= VANISHES * far else None, 1.0 if turn <= VANISHES else None)
-        for slide, turn, far in zip(sliding, turning, distances, strict=True)
+        (
+            float(squared_distance) if velocities <= VANISHES * squared_distance else None,
+            1.0 if angular <= VANISHES else None,
+        )
+        for velocities, angular, squared_distance in zip(of_velocities, of_angular, squared_distances, strict=True)
     ]
 
 

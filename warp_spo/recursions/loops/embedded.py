@@ -80,7 +80,7 @@ class ClosedLoops:
         return {id(link): cluster for cluster in self.clusters for link in cluster.links}
 
     @functools.cached_property
-    def hanging(self) -> dict[int | None, list[Cluster]]:
+    def clusters_on(self) -> dict[int | None, list[Cluster]]:
         """The clusters that hang on each link, by id of the link; None is the inertial frame."""
         found: dict[int | None, list[Cluster]] = {}
         for cluster in self.clusters:
@@ -128,7 +128,7 @@ class ClosedLoops:
                 continue
             self.trace.label(link, "P")
             apart = [id(child) for child in link.children if id(child) not in self.cluster_of]
-            bundles = list(map(id, self.hanging.get(key, ())))
+            bundles = list(map(id, self.clusters_on.get(key, ())))
             carried = [inner[other] for other in apart + bundles]
             force = self._force(link, loads, (wrenches or {}).get(key))
             for other in apart + bundles:
@@ -178,9 +178,9 @@ class ClosedLoops:
     def _shortest(self, cluster: Cluster, swept: Swept, moves: bool) -> tuple[NullSpace, Columns]:
         constrained = self.constrain(cluster)
         swept.margins.extend(constrained.space.margins)
-        return constrained.space, self.demanded(constrained) if moves else {}
+        return constrained.space, self.demanded_accelerations(constrained) if moves else {}
 
-    def demanded(self, constrained: ClusterConstraints) -> Columns:
+    def demanded_accelerations(self, constrained: ClusterConstraints) -> Columns:
         """Return the shortest qdd of a cluster that its velocities demand, by dof; fixed dofs are left out."""
         return constrained.space.particular(
             [-a for a in constrained.accelerations(self.trace.places, self.trace.vector("qd"))]

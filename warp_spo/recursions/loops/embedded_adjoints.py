@@ -87,7 +87,7 @@ def velocities(trace: Trace) -> Entry | None:
 
 
 def forward_dynamics_vjp(trace: Trace, embedding: Embedding, wrt: tuple[str, ...]) -> list[Store]:
-    """J* cotangent of forward dynamics, whose result is "qdd", for the arguments ``wrt``"""
+    """Return stores of J* cotangent by the arguments ``wrt``, J the Jacobian of forward dynamics with result "qdd"."""
     equations, y = ClosedEquations(trace, embedding), trace.vector("cotangent")
     solved = equations.solve(y)
     found = equations.gradient(solved, trace.vector("qdd"), trace.vector("tau"), y)
@@ -96,22 +96,23 @@ def forward_dynamics_vjp(trace: Trace, embedding: Embedding, wrt: tuple[str, ...
 
 
 def inverse_dynamics_vjp(trace: Trace, embedding: Embedding, wrt: tuple[str, ...]) -> list[Store]:
-    """Return J* cotangent of inverse dynamics in the independent dofs, for the arguments ``wrt``.
+    """Return stores of J* cotangent by the arguments ``wrt``, J the Jacobian of inverse dynamics in independent dofs.
 
-    The function is X* (Mass qdd + bias_force) [independent dof], at the qdd = X qdd_independent + k that the closures
-    allow. Its adjoint has the form of forward dynamics' one, with lambda = -X cotangent and multipliers from the
-    columns of Y of the dependent dofs alone, see the file's docstring.
+    That function is X* (Mass qdd + bias_force) [independent dof], at the qdd = X qdd_independent + k that the closures
+    allow. The gradient is the one of the file's docstring with lambda = -X cotangent and with tau and y zero; the
+    multipliers mu and nu, solved with the columns of Y of the dependent dofs alone, stand for how X depends on q.
     """
-    equations, y = ClosedEquations(trace, embedding, embedding.dofs), trace.vector("cotangent")
+    equations, cotangent = ClosedEquations(trace, embedding, embedding.dofs), trace.vector("cotangent")
     place_links(trace, "qd" in trace.inputs)
-    weights = dict.fromkeys(range(trace.links.scene.dof_count), 0.0)  # lambda
+    lam = dict.fromkeys(range(trace.links.scene.dof_count), 0.0)  # lambda, by dof
     qdd = accelerations(equations.loops)
     for independent, column in columns_of_all(equations.loops).items():
         for dof, x in column.items():
-            weights[dof] = weights[dof] - x * y(embedding.dofs.index(independent))
-    found = equations.gradient(weights, qdd.__getitem__, lambda dof: 0.0, lambda dof: 0.0)
-    found |= {("qdd", dof): 0.0 for dof in qdd if dof not in embedding.dofs}  # qdd of dependent dofs is not read
-    return gradient_stores(trace, found, wrt, wrt)
+            lam[dof] = lam[dof] - x * cotangent(embedding.dofs.index(independent))
+    zero: Entry = lambda dof: 0.0  # noqa: E731
+    gradients = equations.gradient(lam, qdd.__getitem__, tau=zero, right=zero)
+    gradients |= {("qdd", dof): 0.0 for dof in qdd if dof not in embedding.dofs}  # qdd of dependent dofs is not read
+    return gradient_stores(trace, gradients, wrt, wrt)
 
 
 def step_vjp(trace: Trace, embedding: Embedding, wrt: tuple[str, ...]) -> list[Store]:

@@ -38,7 +38,7 @@ def columns_of(loops: ClosedLoops, cluster: Cluster, moves: bool) -> tuple[dict[
         for dof in cluster.dofs
         if dof in loops.embedding.dofs
     }
-    return X, loops.demanded(constrained) if moves else {}, constrained.space.lost_pivot
+    return X, loops.demanded_accelerations(constrained) if moves else {}, constrained.space.lost_pivot
 
 
 def columns_of_all(loops: ClosedLoops) -> dict[int, Columns]:
@@ -53,7 +53,7 @@ def demand(loops: ClosedLoops) -> Columns:
     """Return k by dof, zero of dofs that no loop ties; after the links are placed with their velocities."""
     found: Columns = dict.fromkeys(range(loops.trace.links.scene.dof_count), 0.0)
     for cluster in loops.clusters:
-        found |= loops.demanded(loops.constrain(cluster, loops.embedding.dofs))
+        found |= loops.demanded_accelerations(loops.constrain(cluster, loops.embedding.dofs))
     return found
 
 
@@ -234,7 +234,7 @@ def hybrid_dynamics(trace: Trace, embedding: Embedding, mask: tuple[bool, ...]) 
     def allowed(cluster: Cluster) -> tuple[NullSpace | Basis, Columns]:
         if not any(mask[dof] for dof in cluster.dofs):
             constrained = loops.constrain(cluster)
-            return constrained.space, loops.demanded(constrained) if moves else {}
+            return constrained.space, loops.demanded_accelerations(constrained) if moves else {}
         X, k, lost_pivot = columns_of(loops, cluster, moves)
         for dof, column in X.items():
             for other, x in column.items() if mask[dof] else ():

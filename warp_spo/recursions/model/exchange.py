@@ -106,7 +106,7 @@ class WholeTree(Exchange):
 
     def __init__(self, links: Links):
         super().__init__(links)
-        self._pass_index: dict[tuple[str, int], list[Value]] = {}
+        self._messages: dict[tuple[str, int], list[Value]] = {}
 
     @property
     def own_segments(self) -> list[Segment]:
@@ -122,11 +122,11 @@ class WholeTree(Exchange):
         return dof
 
     def send(self, letter: str, segment: Segment, values: Iterable[Value]) -> list[Store]:
-        self._pass_index[letter, segment.index] = list(values)
+        self._messages[letter, segment.index] = list(values)
         return []
 
     def receive(self, letter: str, segment: Segment) -> list[Value]:
-        return self._pass_index[letter, segment.index]
+        return self._messages[letter, segment.index]
 
     def from_children(self, link: Link, letter: str, known: dict[int, Any], build: Callable[[list], Any]) -> list[Any]:
         return [known[id(child)] for child in link.children]
@@ -163,7 +163,7 @@ class SegmentExchange(Exchange):
         self.parent, self.children = self.segment.parent, tuple(self.segment.children)
         self._own = {id(link) for link in self.segment.links}
         self._active = self._own | {id(link) for segment in self.segment.ancestors for link in segment.links}
-        self._places = {dof: at for at, dof in enumerate(self.segment.dofs)}
+        self._dof_places = {dof: at for at, dof in enumerate(self.segment.dofs)}
 
     @property
     def own_segments(self) -> list[Segment]:
@@ -176,7 +176,7 @@ class SegmentExchange(Exchange):
         return id(link) in self._active
 
     def place_of(self, dof: int) -> int:
-        return self._places[dof]
+        return self._dof_places[dof]
 
     def send(self, letter: str, segment: Segment, values: Iterable[Value]) -> list[Store]:
         first = self.offsets[letter, segment.index]

@@ -30,7 +30,7 @@ from .link import BodyPlacement as BodyPlacement
 from .link import Link as Link
 from .link import NodeBody as NodeBody
 from .link import SharedDofs as SharedDofs
-from .rotations import aligned, folded, numbers, pose_of, still
+from .rotations import fold_rotation, numbers, pose_of, rotation_to_axis, still
 
 if TYPE_CHECKING:
     from .shared_constants import SharedConstants
@@ -204,8 +204,8 @@ class Links:
         R_c, p_c = poses["joint_X_c"][scene.hinge_of[node]]
         com = numbers(R_c.T @ (self.values["body_com"][node] - p_c))
         return NodeBody(
-            (folded(R), Vector(p.tolist())),
-            (folded(R_c), Vector(p_c.tolist())),
+            (fold_rotation(R), Vector(p.tolist())),
+            (fold_rotation(R_c), Vector(p_c.tolist())),
             Vector(com.tolist()),
             self.rigid(node, R_c, com),
         )
@@ -240,13 +240,15 @@ class Links:
         """Where a frame of a body, or with -1 of the inertial frame, sits."""
         R, p = pose_of(pose)
         if body < 0:
-            return BodyPlacement(None, folded(R), Vector(p.tolist()))
+            return BodyPlacement(None, fold_rotation(R), Vector(p.tolist()))
         if (body, tuple(p.tolist())) in self.ports:
             port = self.ports[body, tuple(p.tolist())]
-            return BodyPlacement(port.link, port.matrix @ folded(R), port.offset)
+            return BodyPlacement(port.link, port.matrix @ fold_rotation(R), port.offset)
         placement, (R_body, p_body) = self.placements[body], self.nodes[body].anchor
         axes = placement.matrix @ R_body.T
-        return BodyPlacement(placement.link, axes @ folded(R), placement.offset + axes @ (Vector(p.tolist()) - p_body))
+        return BodyPlacement(
+            placement.link, axes @ fold_rotation(R), placement.offset + axes @ (Vector(p.tolist()) - p_body)
+        )
 
     def carrier(self, body: int) -> Link | None:
         """The link that the centre of mass of a body sits on."""
@@ -282,7 +284,7 @@ class Links:
         index = scene.hinge_of[node]
         R, l = body.tree
         if node in self.ports:  # the parent's point that carries it, in the axes of the parent's body frame
-            placement, R, l = self.ports[node], folded(self.poses["joint_X_p"][index][0]), ZERO
+            placement, R, l = self.ports[node], fold_rotation(self.poses["joint_X_p"][index][0]), ZERO
         matrix, offset, link = placement.matrix @ R, placement.offset + placement.matrix @ l, placement.link
         dof, coordinate = int(scene.qd_start[index]), int(scene.q_start[index])
         armatures = self.values["joint_armature"].tolist()
@@ -290,7 +292,7 @@ class Links:
         for kind, axis in scene.hinges[index].elements:
             if isinstance(kind, Amplitudes):
                 break
-            align = None if axis is None else aligned(axis)
+            align = None if axis is None else rotation_to_axis(axis)
             own = range(dof, dof + kind.dofs)
             link = Link(
                 link,

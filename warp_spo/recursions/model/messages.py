@@ -41,11 +41,12 @@ NEEDS = {"U": "qd", "L": "body_f", "O": "ground_origin_later", "X": "poses_out"}
 
 
 def channel(letter: str) -> str:
+    """Return the name of the array that a message goes through."""
     return OUTWARD if letter in OUTWARD_LETTERS else INWARD
 
 
 def size(letter: str, segment: Segment) -> int:
-    """Values of a message."""
+    """Return how many values a message of a segment has."""
     if letter in SIZES:
         return SIZES[letter]
     if letter == "X":
@@ -57,7 +58,7 @@ def size(letter: str, segment: Segment) -> int:
     ]
 
 
-def needed(letters: str, inputs: Collection[str]) -> str:
+def select_sent(letters: str, inputs: Collection[str]) -> str:
     """Return those of the letters that are sent where these arrays are read."""
     return "".join(letter for letter in letters if letter not in NEEDS or NEEDS[letter] in inputs)
 

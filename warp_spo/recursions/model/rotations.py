@@ -22,7 +22,7 @@ def pose_of(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return numbers(rotation), numbers(value[:3])
 
 
-def folded(rotation: np.ndarray) -> Matrix:
+def fold_rotation(rotation: np.ndarray) -> Matrix:
     """Return a rotation; if it is constant, entries that are 0 or 1 but for rounding become so, and fold."""
     rotation = numbers(rotation)
     if rotation.dtype == object:
@@ -33,11 +33,11 @@ def folded(rotation: np.ndarray) -> Matrix:
 
 def still(matrix: Matrix) -> Matrix | None:
     """Return a link's matrix, folded where it is constant; None if it turns nothing."""
-    matrix = folded(np.array(matrix, dtype=object))
+    matrix = fold_rotation(np.array(matrix, dtype=object))
     return None if matrix == IDENTITY else matrix
 
 
-def aligned(axis: np.ndarray) -> Matrix:
+def rotation_to_axis(axis: np.ndarray) -> Matrix:
     """Return a rotation that takes z to ``axis``; a permutation of the axes where that can be."""
     z = axis / np.linalg.norm(axis)
     near = np.round(z)

@@ -17,7 +17,7 @@ from ...hinges.rotor_axis import RotorAxis
 from ...scene.gears import Rotor
 from ...trace.spatial import ZERO, Matrix, Pose, Rigid, Vector, symmetric
 from .link import Link, SharedDofs
-from .rotations import aligned, still
+from .rotations import rotation_to_axis, still
 
 if TYPE_CHECKING:
     from .links import Links
@@ -28,7 +28,7 @@ def add(links: Links, driven: Link, rotor: Rotor, axes: Matrix, origin: Vector) 
     link = dataclasses.replace(
         driven,
         hinge=RotorAxis(rotor.ratio),
-        matrix=still(axes @ aligned(rotor.axis)),
+        matrix=still(axes @ rotation_to_axis(rotor.axis)),
         offset=origin + axes @ Vector(rotor.com.tolist()),
         align=None,
         armature=(0.0,),
@@ -43,7 +43,7 @@ def add(links: Links, driven: Link, rotor: Rotor, axes: Matrix, origin: Vector) 
         if rotor.model == "full":
             link.add(across_axis(rotor))
         else:
-            driven.parent.add(locked(rotor, axes, origin))
+            driven.parent.add(locked_inertia(rotor, axes, origin))
     driven.shared_dofs = link.shared_dofs = SharedDofs([driven, link])
     links.append(link)
 
@@ -54,10 +54,10 @@ def across_axis(rotor: Rotor) -> Rigid:
     return Rigid(rotor.mass, ZERO, symmetric(across, across, 0.0, 0.0, 0.0, 0.0))
 
 
-def locked(rotor: Rotor, axes: Matrix, origin: Vector) -> Rigid:
-    """Return the same in the frame in which the hinge's parent anchor sits at ``origin`` in ``axes``."""
+def locked_inertia(rotor: Rotor, axes: Matrix, origin: Vector) -> Rigid:
+    """Return :func:`across_axis` in the frame that has the hinge's parent anchor at ``origin`` in ``axes``."""
     at = origin + axes @ Vector(rotor.com.tolist())
-    return Pose(None, axes @ aligned(rotor.axis), at).rigid_to_parent(across_axis(rotor))
+    return Pose(None, axes @ rotation_to_axis(rotor.axis), at).rigid_to_parent(across_axis(rotor))
 
 
 def own_link(links: Links, node: int) -> Link | None:

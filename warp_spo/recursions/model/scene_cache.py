@@ -17,9 +17,9 @@ def cached_by_scene(evaluate: Callable[[Scene], T]) -> Callable[[Scene], T]:
     known: weakref.WeakKeyDictionary[Scene, T] = weakref.WeakKeyDictionary()
 
     @functools.wraps(evaluate)
-    def found(scene: Scene) -> T:
+    def cached(scene: Scene) -> T:
         if scene not in known:
             known[scene] = evaluate(scene)
         return known[scene]
 
-    return found
+    return cached

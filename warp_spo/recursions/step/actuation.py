@@ -146,7 +146,7 @@ class ActuatorLaws:
         trace: the evaluation; "ctrl" is among its inputs, "q" and "qd" are the state of its sweep.
         h: length of the step [s].
         qd: entries of the velocities that the step starts from.
-        ahead: entries of what the step adds to q of the sweep if u = 0.
+        drift: entries of what the step adds to q of the sweep if u = 0.
     """
 
     def __init__(self, trace: Trace, h: Value, qd: Entry, drift: Entry):
@@ -160,10 +160,10 @@ class ActuatorLaws:
     def _law(self, number: int, one: Moved) -> Law:
         servo = any(not is_number(below_zero(slope), 0.0) for slope in self.actuation.slopes(number))
         if servo and len(self.actuation.moved[number]) == 1:
-            return self._servo(number, one)
-        return self._linear(number, one)
+            return self._servo_law(number, one)
+        return self._linear_law(number, one)
 
-    def _servo(self, number: int, one: Moved) -> Law:
+    def _servo_law(self, number: int, one: Moved) -> Law:
         """Return spring and damper on one hinge, in u, between bounds at the rate of the sweep's state."""
         actuation, (dof, coordinate, gear) = self.actuation, one
         (stiff, damp), at = actuation.slopes(number), self.at(dof)
@@ -186,20 +186,28 @@ class ActuatorLaws:
         least, most = (None if is_constant(end) and np.isinf(end) else end for end in (least, most))
         return Law(line, resistance, least, most, absolute(strong))
 
-    def _linear(self, number: int, one: Moved) -> Law:
-        """Return the force at the sweep's state, moved along its velocity, and a resistance to changes of the rate."""
-        actuation = self.actuation
-        gain = lambda dof: self.at(dof) - self.qd(dof)  # noqa: E731  u of the sweep's state
-        after = lambda other: actuation.q(other.coordinate) + self._implicit(number, other, gain)  # noqa: E731
-        force, slope = actuation.push(number, after, self.h)
-        strong = actuation.value("actuator_strength", number) * one.gear
-        wide = total(absolute(other.gear) for other in actuation.moved[number])
-        resistance = absolute(strong) * wide * slope
-        return Law(strong * force + resistance * gain(one.dof), resistance)
+    def _linear_law(self, number: int, one: Moved) -> Law:
+        """Return a law that is linear in u, the change of the dof's rate in the step, about u of the sweep's state.
 
-    def _implicit(self, number: int, one: Moved, gain: Entry) -> Value:
+        Coordinates are those that this u leads to at the end of the step, where a spring makes the force implicit.
+        """
+        actuation = self.actuation
+
+        def rate_change(dof: int) -> Value:
+            return self.at(dof) - self.qd(dof)
+
+        def coordinate(other: Moved) -> Value:
+            return actuation.q(other.coordinate) + self._implicit_displacement(number, other, rate_change)
+
+        force, slope = actuation.push(number, coordinate, self.h)
+        factor = actuation.value("actuator_strength", number) * one.gear
+        gear_sum = total(absolute(other.gear) for other in actuation.moved[number])
+        resistance = absolute(factor) * gear_sum * slope
+        return Law(factor * force + resistance * rate_change(one.dof), resistance)
+
+    def _implicit_displacement(self, number: int, one: Moved, rate_change: Entry) -> Value:
         """Return how far a coordinate moves in the step, where the force may depend on it implicitly; else 0."""
-        moved = self.drift(one.dof) + self.h * gain(one.dof)
+        moved = self.drift(one.dof) + self.h * rate_change(one.dof)
         return select(less(self.actuation.slopes(number)[0], 0.0), moved, 0.0)
 
 

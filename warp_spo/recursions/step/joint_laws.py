@@ -212,17 +212,26 @@ class JointLaws:
         every = []
         for i, dof in enumerate(link.dofs):
             unbounded = [*self._damper(dof), *self._spring(link, i, "joint_stiffness", self._rest)]
-            drive, actuators = self._drive(link, i), self.actuators(dof)
-            effort = self.effort_limit(dof) if drive or actuators else None
-            if effort is not None and actuators and (drive or not self.is_weak(dof, reach(actuators))):
-                drive, actuators = [], limit_sum(drive + actuators, effort)
-            elif effort is not None:
-                drive = limit_sum(drive, effort)
+            drive, actuators = self._motors(link, i)
             found = [*drive, *self._limits(link, i), *self._friction(dof), *actuators]
             found += self._rate_limit(dof, unbounded + found)
             unbounded += [law for law in found if not law.has_bounds]
             every.append([add_laws(unbounded)] * bool(unbounded) + [law for law in found if law.has_bounds])
         return every
+
+    def _motors(self, link: Link, i: int) -> tuple[list[Law], list[Law]]:
+        """Return the laws of the drive of a dof of a link, and those of its actuators, within its effort limit."""
+        dof = link.dofs[i]
+        drive, actuators = self._drive(link, i), self.actuators(dof)
+        effort = self.effort_limit(dof) if drive or actuators else None
+        if effort is not None and actuators and (drive or not self.is_weak(dof, reach(actuators))):
+            return [], limit_sum(drive + actuators, effort)
+        return drive if effort is None else limit_sum(drive, effort), actuators
+
+    def springs_and_motors(self, link: Link, i: int) -> list[Law]:
+        """Return the laws of the spring, the drive and the actuators of a dof of a link."""
+        drive, actuators = self._motors(link, i)
+        return [*self._spring(link, i, "joint_stiffness", self._rest), *drive, *actuators]
 
     def passive(self, link: Link) -> list[Law]:
         """Return damper and spring of each dof of a link, added up."""

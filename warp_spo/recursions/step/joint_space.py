@@ -21,18 +21,18 @@ Entries = dict[tuple[int, int], Value]  # (row, column), row <= column
 
 
 class JointSpace:
-    """Mass, and bias force less the loads, at the state of a trace.
+    """Mass, and bias force less the loads, at the state of a trace; without velocity terms if not ``moves``.
 
     Attributes:
         mass: entries of the upper triangle that the tree allows. bias: by dof.
     """
 
-    def __init__(self, trace: Trace):
+    def __init__(self, trace: Trace, moves: bool = True):
         self.trace, self.dofs = trace, range(trace.links.scene.dof_count)
         self.mass: Entries = {
             (item.index[0], item.index[1]): item.value for item in mass_matrix(trace) if item.index[0] <= item.index[1]
         }
-        self.bias = {item.index[0]: item.value for item in inverse_dynamics(trace, qdd=lambda dof: 0.0)}
+        self.bias = {item.index[0]: item.value for item in inverse_dynamics(trace, qdd=lambda dof: 0.0, moves=moves)}
 
     def solve(self, delta: Callable[[int], Value], b: Callable[[int], Value]) -> list[Value]:
         """Return (Mass + diag(delta))^-1 (b - bias), by dof; NaN where a pivot is not positive beyond rounding."""

@@ -20,6 +20,7 @@ from ...trace.emission import Store
 from ...trace.scalars import Value, alone, floor, less, reciprocal, select
 from ...trace.spatial import total
 from ..articulated_sweeps import StepTerms, expand, reduce
+from ..contact.velocity_kicks import KICK, START
 from ..kinematics import body_states
 from ..model.links import Link
 from ..model.segments import Segment
@@ -47,17 +48,27 @@ class Step:
 
     The sweep is evaluated at the state ``q``, ``qd``. The step starts there too, unless ``q_from`` and ``qd_from`` are
     inputs: the sweep's state is then an intermediate point, at which the laws are evaluated.
+
+    Attributes:
+        has_kicks: velocity terms are kicks before and after the step, see :mod:`..contact.velocity_kicks`; ``qd`` is
+            after the first one, and all but the hinges' laws is at the midpoint; qdd is what the sweeps find, without
+            kicks.
     """
 
     def __init__(self, trace: Trace):
         self.trace, self.links = trace, [link for link in trace.own_links if link.is_leader]
+        self.has_kicks, before, self.kick = KICK in trace.inputs, trace.vector("qd"), trace.vector(KICK)
+        if self.has_kicks:
+            trace.substitutes = {"q": trace.vector(START), "qd": lambda dof: before(dof) + self.kick(dof)}
         trace.compensate_gravity()
         vector, given = trace.vector, trace.inputs
         self.h = trace.graph.input("dt", 0)
         apart = "q_from" in given
-        self.carries = not apart
+        self.carries = not apart and not self.has_kicks
         self.q, self.qd = (vector("q_from"), vector("qd_from")) if apart else (vector("q"), vector("qd"))
         self.joint_laws = build_joint_laws(trace, self.h)
+        if self.has_kicks:
+            del trace.substitutes["q"]  # the sweep is at the midpoint, its laws are not
         self.laws: dict[int, list[Law]] = {}  # by dof
         self.forces: dict[int, Value] = {}
         self.messages: list[Store] = []  # to other segments
@@ -77,7 +88,7 @@ class Step:
         rates_after = {dof: self.qd(dof) + gain for dof, gain in gains.items()}
         stores: list[Store] = []
         for link, coordinates, rates in self.states_after(rates_after):
-            stores += [Store("out", (dof,), rate) for dof, rate in zip(link.dofs, rates, strict=True)]
+            stores += [Store("out", (dof,), rate + self.kick(dof)) for dof, rate in zip(link.dofs, rates, strict=True)]
             stores += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(coordinates)]
             if qdd:
                 stores += [Store("qdd_out", (dof,), gains[dof] * reciprocal(self.h)) for dof in link.dofs]
@@ -105,7 +116,8 @@ class Step:
         if self._uses_joint_space:
             return self._in_joint_space(tau)
         terms = StepTerms(self._with_resistance)
-        done, rates, sent = reduce(self.trace, tau, moves=True, loads=True, phases=self.phases, terms=terms)
+        moves = not self.has_kicks
+        done, rates, sent = reduce(self.trace, tau, moves=moves, loads=True, phases=self.phases, terms=terms)
         stores = sent + expand(self.trace, done, rates, self.trace.base_acceleration)
         self.messages = [item for item in stores if item.array != "out"]
         return {item.index[0]: item.value for item in stores if item.array == "out"}
@@ -119,7 +131,7 @@ class Step:
 
     def _in_joint_space(self, tau: Callable[[int], Value]) -> dict[int, Value]:
         """Return the same from a system that is formed once for all passes."""
-        system = JointSpace(self.trace)
+        system = JointSpace(self.trace, moves=not self.has_kicks)
         pieces: dict[int, Law] = {}
         self.phases.add_invariants([*system.mass.values(), *system.bias.values()])
         for link in self.links:

@@ -1,0 +1,187 @@
+"""A task's file to start from, for a robot: ``python -m warp_spo.tasks --new FILE.py --robot ROBOT.xml``."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import textwrap
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import shown
+from ..scene.parts import UNLIMITED
+
+WIDTH = 114  # of lines of the file
+
+
+def robot_task(file: Path, robot: Path) -> str:
+    """Return the text of a task's file for the robot of an MJCF file.
+
+    A robot that floats stands and follows velocities, one on a fixed base holds the pose from which episodes start.
+    Actions, observations, ends and events follow from the robot's joints and actuators.
+
+    Args:
+        file: that the text is for. robot: MJCF file.
+
+    Raises:
+        ValueError: the robot's file is no MJCF, or cannot be read, or holds nothing that moves. OSError: there is none.
+    """
+    if robot.suffix.lower() not in (".xml", ".mjcf"):
+        raise ValueError(
+            f"--robot {str(robot)!r}: expected an MJCF file, .xml; a URDF says neither gains nor motors: the page on "
+            "training has the way from one"
+        )
+    from .. import load
+    from ..mujoco.mjcf import initial_q
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # which the task says when it is trained
+        scene = load(robot, contacts=True)
+        start = initial_q(robot)
+    single = [i for i, hinge in enumerate(scene.hinges) if hinge.coord_count == hinge.dof_count == 1]
+    if not single:
+        raise ValueError(f"--robot {str(robot)!r}: has no joint of one coordinate; expected one or more to act on")
+    floats = any(hinge.kind == "free" and hinge.parent == -1 for hinge in scene.hinges)
+    endless = _endless(scene, single)
+    name = os.path.relpath(robot.resolve(), file.resolve().parent)
+    return "\n".join([
+        _head(shown(robot.stem), name, file, floats),
+        _start(scene, start),
+        *([] if floats or not endless else [_angles(endless)]),
+        _build(scene, single, endless, floats),
+    ])  # fmt: skip
+
+
+def _endless(scene: Any, single: list[int]) -> list[str]:
+    """Return the labels of the joints that turn without limits."""
+    bounds = [abs(scene.values[f"joint_limit_{end}"][0]) for end in ("lower", "upper")]
+    free = np.minimum(*bounds) >= UNLIMITED
+    turns = [i for i in single if scene.hinges[i].kind == "revolute" and free[scene.qd_start[i]]]
+    return [scene.joint_labels[i] for i in turns]
+
+
+def _names(labels: list[str]) -> str:
+    """Return labels as the regular expressions that match them alone, in Python's words."""
+    texts = [json.dumps(re.escape(label).replace("\\ ", " ")) for label in labels]
+    return texts[0] if len(texts) == 1 else f"({', '.join(texts)})"
+
+
+def _head(robot: str, path: str, file: Path, floats: bool) -> str:
+    about = "follows velocities" if floats else "holds the pose from which it starts"
+    parts = ("Observation", "actions", *["commands"] * floats, "events", "observations", "rewards")
+    parts += ("terminations",) * floats
+    return f'''\
+# A task of your own, made for {path}. It trains as it is; what the robot shall do is yours to say, in rewards.
+#   python -m warp_spo.train {file}                           trains it, into runs/{file.stem}
+#   python -m warp_spo.play {file} runs/{file.stem}/last.pt --export {file.stem} --film gif
+"""{robot} {about}."""
+
+from pathlib import Path
+
+import numpy as np
+
+import warp_spo as spo
+from warp_spo.env import {", ".join(parts)}
+from warp_spo.env.learning import Learner
+from warp_spo.env.settings import make_env
+
+ROBOT = {json.dumps(path)}  # from this file's folder; films and pages draw it, and play --mujoco runs it
+# Settings of PPO: --set learner.NAME=VALUE changes one for a training. On a GPU take 4096 worlds.
+LEARNER = Learner(iterations=300, worlds=512, steps=24, hidden=(128, 64))'''
+
+
+def _start(scene: Any, start: np.ndarray) -> str:
+    if scene.keyframes:
+        names = list(map(json.dumps, scene.keyframes))
+        return f"# Where episodes start: the name of a keyframe of the file, {', '.join(names)}.\nSTART = {names[0]}"
+    order = "x, y, z, quaternion xyzw, joints" if scene.hinges[0].coord_count == 7 else "in the order of q"
+    lines = textwrap.wrap(", ".join(map(_text, start)), WIDTH - 4)
+    text = lines[0] if len(lines) == 1 else "\n    " + "\n    ".join(lines) + "\n"
+    return f"# Where episodes start, and the file stands: {order}.\nSTART = [{text}]"
+
+
+def _angles(endless: list[str]) -> str:
+    return f'''\
+ENDLESS = {_names(endless)}  # joints that turn without limits
+
+
+def angles(w):
+    """Return sine and cosine of these joints, which are alike after each turn."""
+    return [function(angle) for angle in w.joint_q(ENDLESS) for function in (np.sin, np.cos)]'''
+
+
+def _action(scene: Any) -> tuple[str, str]:
+    """Return the text of the actions, and what they are in words."""
+    if not scene.actuators:
+        return "actions.Effort(scale=1.0, clip=(-1.0, 1.0))", "forces of joints [N m or N]: the file has no actuators"
+    servos = [each.gain > 0.0 and each.bias[1] == -each.gain and len(each.hinges) == 1 for each in scene.actuators]
+    if all(servos):
+        return 'actions.Control(scale=0.3, offset="default")', "targets of the file's servos, about START [rad or m]"
+    ranges = np.array([each.ctrl_range for each in scene.actuators])
+    ranges = np.where(np.isfinite(ranges).all(axis=1, keepdims=True), ranges, (-1.0, 1.0))
+    middle, half = ranges.mean(axis=1), 0.5 * np.ptp(ranges, axis=1)
+    given = [f"{name}={_number(each)}" for name, each in (("scale", half), ("offset", middle)) if each.any()]
+    return f"actions.Control({', '.join([*given, 'clip=(-1.0, 1.0)'])})", "controls of the file's actuators"
+
+
+def _number(values: np.ndarray) -> str:
+    """Return one number where all are alike, otherwise a list."""
+    return _text(values[0]) if np.ptp(values) == 0.0 else f"[{', '.join(map(_text, values))}]"
+
+
+def _text(x: float) -> str:
+    return repr(float(f"{x:.6g}"))
+
+
+def _build(scene: Any, single: list[int], endless: list[str], floats: bool) -> str:
+    action, meaning = _action(scene)
+    limited = [label for i in single if (label := scene.joint_labels[i]) not in endless]
+    seen = ["observations.base_velocity", "observations.base_angular_velocity", "observations.projected_gravity"]
+    seen = seen if floats else []
+    if limited:
+        seen.append(f"observations.joint_position({_names(limited) if endless else ''})")
+    seen += [] if floats or not endless else ["angles"]  # the angle of a wheel says nothing
+    seen += ["Observation(observations.joint_velocity(), scale=0.1)", "observations.last_action"]
+    seen += ["observations.command"] if floats else []
+    spread = f"events.joints(position=(-0.05, 0.05){f', names={_names(limited)}' if endless else ''})"
+    changes = [spread] if limited else []
+    if floats:
+        goal = """\
+            "alive": (1.0, rewards.alive),
+            "velocity": (2.0, rewards.track_velocity(0.5)),
+            "turning": (1.0, rewards.track_turning(0.5)),
+            "tilt": (-2.0, rewards.tilt),"""
+        changes = ["events.base(yaw=(-np.pi, np.pi), pitch=(-0.05, 0.05))", *changes, "events.push(velocity=0.3)"]
+        more = """
+        commands=commands.Velocity(forward=(-0.5, 0.5), left=(0.0, 0.0), turn=(-1.0, 1.0), seconds=(3.0, 8.0)),
+        terminations={"fell over": terminations.tilted(np.radians(60.0))},"""
+    else:
+        goal, more = '            "pose": (1.0, rewards.posture(0.3)),', ""
+    rows = lambda parts: "\n".join(f"            {part}," for part in parts)  # noqa: E731
+    pose = "scene.keyframes[START].q" if scene.keyframes else "START"
+    loops = ".without_loops()" if scene.constraint_summary else ""
+    return f'''
+
+def build(worlds, device=None, seed=0, **options):
+    """Return the environment; what make_env gets by name, --set changes."""
+    scene = spo.load(Path(__file__).parent / ROBOT, contacts=True){loops}
+    return make_env(
+        scene, worlds, device, options, seed=seed, dt=5e-3, decimation=4, default_q={pose},
+        episode_length_s=10.0,
+        actions={action},  # {meaning}{more}
+        observations={{"actor": [
+{rows(seen)}
+        ]}},
+        rewards={{  # by name (weight, term); a term is a function of one world, such as lambda w: w.base_height
+{goal}
+            "action rate": (-0.01, rewards.action_rate),
+        }},
+        events=[
+{rows(changes)}
+        ],
+    )  # fmt: skip
+'''
