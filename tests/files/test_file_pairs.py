@@ -329,18 +329,26 @@ def test_what_pairs_do_not_take_is_said():
     assert len(quiet(spo.from_mujoco, model, pairs=[("palm", "side")]).contact_pairs) == 1
 
 
+CROWD = """<mujoco><worldbody><geom type="plane" size="1 1 1"/>{}</worldbody></mujoco>""".format(
+    "".join(f'<body name="b{i}"><freejoint/><geom name="g{i}" size=".1" condim="{{0}}"/></body>' for i in range(9))
+)
+
+
 def test_pairs_that_no_step_takes_are_left_out_of_true_and_refused_of_all():
-    """Ant's 44 where it has actuators; the same without them are taken."""
+    """Where the ground has torsional friction; without it, and where there are actuators, many are taken."""
+    model = mujoco.MjModel.from_xml_string(CROWD.format(4))
+    why = "steps of a scene with torsional friction do not solve so many"
     with pytest.warns(
-        UserWarning, match=r"44 pair\(s\) of shapes, such as .*, because steps of a scene with actuators"
+        UserWarning, match=rf"36 pair\(s\) of shapes, such as .*, because {why} \(pairs=\[\.\.\.\] takes"
     ):
-        scene = spo.load(shipped("ant"), contacts=True)
-    assert not scene.contact_pairs and len(scene.contact_points) == 25
-    spec = mujoco.MjSpec.from_file(str(shipped("ant")))
-    for actuator in list(spec.actuators):
-        spec.delete(actuator)
-    scene = quiet(spo.from_mujoco, spec.compile(), contacts=True)
-    assert (len(scene.contact_pairs), len(scene.contact_points)) == (44, 25)
+        scene = spo.from_mujoco(model, contacts=True)
+    assert not scene.contact_pairs and len(scene.contact_points) == 9
+    with pytest.raises(spo.UnsupportedError, match=rf"pairs='all' of 36 pairs of shapes, more than 32 \({why}\)"):
+        quiet(spo.from_mujoco, model, contacts="ground", pairs="all")
+    scene = spo.from_mujoco(mujoco.MjModel.from_xml_string(CROWD.format(3)), contacts=True)
+    assert (len(scene.contact_pairs), len(scene.contact_points)) == (36, 9)
+    scene = quiet(spo.load, shipped("ant"), contacts=True)
+    assert (len(scene.contact_pairs), len(scene.contact_points), len(scene.actuators)) == (44, 25, 8)
 
 
 def test_contacts_true_of_a_model_and_a_urdf_have_their_pairs(tmp_path):
@@ -393,7 +401,6 @@ def test_hulls_whose_faces_are_too_large_together_are_left_out():
 
 
 @pytest.mark.parametrize("pairs, error, words", [
-    ("all", spo.UnsupportedError, r"nv_ant.xml': pairs='all' of 44 pairs of shapes, more than 32"),
     ([("torso_geom", "nobody")], ValueError, r"nv_ant.xml': pairs holds 'nobody', which is no collision shape"),
     ("some", TypeError, r"pairs is 'some'; expected 'all', or a list of pairs of names"),
 ])  # fmt: skip

@@ -16,6 +16,7 @@ from .contact_shapes import BOX, ConvexShape
 from .frames import pose_matrix
 
 DEEP = 1e-3  # an overlap that is said [m]; shapes of one surface, as drawn, overlap by less
+SOME = 60  # directions that are tried first
 NAMED = 4  # pairs in the message
 
 
@@ -62,7 +63,10 @@ def _overlaps(scene: Any, first: int) -> Iterator[tuple[float, int]]:
             continue
         a, b = (_solid(shape) for shape in pair.shapes)
         turn_a, turn_b = (place[None, :3, :3] for place in places)
-        depth = float(PosedPair(a, b, turn_a, turn_b, between[None]).least().depth[0])
+        posed = PosedPair(a, b, turn_a, turn_b, between[None])
+        if posed.least(SOME, improve=False).depth[0] <= DEEP:  # no direction gives less than the true depth
+            continue
+        depth = float(posed.least().depth[0])
         if depth > DEEP:
             yield depth, pair.contact
 

@@ -89,12 +89,12 @@ def load(
         pairs: Which shapes of two bodies touch each other: "all" that the file lets touch, those with shapes that stand
             still, such as a table, included; or a list of pairs of names, patterns of shapes or bodies, such as
             ``[("cube", "*finger*")]``; [], none. None: all with contacts=True, and none otherwise, of which patterns of
-            ``contacts`` warn. More than 32 need a scene that is solved in joint space, without actuators for example;
-            there contacts=True leaves them out, with a warning. An MJCF file lets geoms touch by MuJoCo's rules: masks,
-            ``<pair>``, ``<exclude>``, not those of a body and its parent; a URDF all but links next to each other,
-            where links that fixed joints connect are one; a USD file by its filters and collision groups. Each is one
-            contact with ``other``, see :class:`Contact`; boxes, spheres, capsules and convex meshes of up to 64 corners
-            can touch.
+            ``contacts`` warn. More than 32 need a scene that is solved in joint space, which one with torsional
+            friction on the ground is not; there contacts=True leaves them out, with a warning. An MJCF file lets geoms
+            touch by MuJoCo's rules: masks, ``<pair>``, ``<exclude>``, not those of a body and its parent; a URDF all
+            but links next to each other, where links that fixed joints connect are one; a USD file by its filters and
+            collision groups. Each is one contact with ``other``, see :class:`Contact`; boxes, spheres, capsules and
+            convex meshes of up to 64 corners can touch.
 
     Raises:
         FileNotFoundError: There is no such file.
