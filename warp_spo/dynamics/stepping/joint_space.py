@@ -39,7 +39,7 @@ NEAR, NEAR_A_BODY = 256, 4
 """Pairs that may be near in a world: so many, or so many for each body of a pair. One takes 240 bytes in float32."""
 FULL, LEAST, LEAST_A_BODY = 8, 16, 2
 """Of FULL pairs, or of as many as there are bodies of a pair, all points have slots. In a pile a body lies on one or
-two others, mostly with four points. LEAST slots, or LEAST_A_BODY for each body, are kept where shared memory is short."""
+two others, mostly with four points. Where shared memory is short, LEAST slots, or LEAST_A_BODY for each body, stay."""
 
 
 def reason_against(scene: Scene, variable: tuple[str, ...]) -> str:
