@@ -150,15 +150,15 @@ def _build(scene: Any, single: list[int], endless: list[str], floats: bool) -> s
     spread = f"events.joints(position=(-0.05, 0.05){f', names={_names(limited)}' if endless else ''})"
     changes = [spread] if limited else []
     if floats:
-        goal = '''\
+        goal = """\
             "alive": (1.0, rewards.alive),
             "velocity": (2.0, rewards.track_velocity(0.5)),
             "turning": (1.0, rewards.track_turning(0.5)),
-            "tilt": (-2.0, rewards.tilt),'''
+            "tilt": (-2.0, rewards.tilt),"""
         changes = ["events.base(yaw=(-np.pi, np.pi), pitch=(-0.05, 0.05))", *changes, "events.push(velocity=0.3)"]
-        more = '''
+        more = """
         commands=commands.Velocity(forward=(-0.5, 0.5), left=(0.0, 0.0), turn=(-1.0, 1.0), seconds=(3.0, 8.0)),
-        terminations={"fell over": terminations.tilted(np.radians(60.0))},'''
+        terminations={"fell over": terminations.tilted(np.radians(60.0))},"""
     else:
         goal, more = '            "pose": (1.0, rewards.posture(0.3)),', ""
     rows = lambda parts: "\n".join(f"            {part}," for part in parts)  # noqa: E731
