@@ -19,7 +19,8 @@ BALANCER = f"""<mujoco><worldbody><geom type="plane" size="0 0 .1"/>
 </body></worldbody><actuator>
   <motor joint="left wheel" gear=".6" ctrlrange="-1 3"/><motor joint="right wheel" gear=".6" ctrlrange="-1 3"/>
 </actuator></mujoco>"""
-ARM = """<mujoco><worldbody><body><joint name="turn" axis="0 0 1"/><geom type="capsule" size=".05" fromto="0 0 0 0 0 .3"/>
+ARM = """<mujoco><worldbody><body><joint name="turn" axis="0 0 1"/>
+  <geom type="capsule" size=".05" fromto="0 0 0 0 0 .3"/>
   <body pos="0 0 .3"><joint name="lift.1" axis="0 1 0" range="-90 90"/>
     <geom type="capsule" size=".03" fromto="0 0 0 .3 0 0"/></body></body></worldbody>
 <actuator><position joint="turn" kp="20"/><position joint="lift.1" kp="20"/></actuator>

@@ -1,4 +1,4 @@
-"""A task's file to start from, for a robot of one's own: ``python -m warp_spo.tasks --new FILE.py --robot ROBOT.xml``."""
+"""Files of tasks for a robot of one's own: ``python -m warp_spo.tasks --new FILE.py --robot ROBOT.xml``."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ WIDTH = 114  # of lines of the file
 
 
 def robot_task(file: Path, robot: Path) -> str:
-    """Return the text of a task's file for the robot of an MJCF file: a robot that floats stands and follows velocities.
+    """Return the text of a task's file for the robot of an MJCF file.
 
-    One on a fixed base holds the pose from which episodes start. Actions, observations, ends and events follow from the
-    robot's joints and actuators.
+    A robot that floats stands and follows velocities, one on a fixed base holds the pose from which episodes start.
+    Actions, observations, ends and events follow from the robot's joints and actuators.
 
     Args:
         file: that the text is for. robot: MJCF file.
