@@ -36,12 +36,10 @@ def robot_task(file: Path, robot: Path) -> str:
             "training has the way from one"
         )
     from .. import load
-    from ..mujoco.mjcf import initial_q
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # which the task says when it is trained
         scene = load(robot, contacts=True)
-        start = initial_q(robot)
     reads = "contacts=True" if scene.contacts else ""
     single = [i for i, hinge in enumerate(scene.hinges) if hinge.coord_count == hinge.dof_count == 1]
     if not single:
@@ -53,7 +51,7 @@ def robot_task(file: Path, robot: Path) -> str:
     name = os.path.relpath(robot.resolve(), file.resolve().parent)
     return "\n".join([
         _head(shown(robot.stem), name, file, floats),
-        _start(scene, start),
+        _start(scene, scene.initial_q),
         *([] if floats or not endless else [_angles(endless)]),
         _build(scene, single, endless, floats, reads),
     ])  # fmt: skip
