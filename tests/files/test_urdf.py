@@ -255,6 +255,13 @@ def test_what_urdf_does_not_define_is_named_once(tmp_path):
     ]
     assert len(said) == 1 and all(one in said[0] for one in words), said
     assert said[0].count(" of joints ") + said[0].count(" of links ") == len(words) and "scene.with_values" in said[0]
+    long = [LINK.format("a"), *(f'<link name="{i}{"x" * 70_000}" {"y" * 70_000}{i}="1"/>' for i in range(99))]
+    tied = [JOINT.format(i, "revolute", "a", f"{i}{'x' * 70_000}", "<o/>") for i in range(99)]
+    with pytest.warns(
+        UserWarning, match=r"<o> of joints '0', '1', '2' and 96 more, .*, and 90 more; correct"
+    ) as caught:
+        load(written(tmp_path, robot(*long, *tied)), repair=False)
+    assert len(str(caught[0].message)) < 4000
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         load(written(tmp_path, robot(*pair("revolute", LIMIT))))

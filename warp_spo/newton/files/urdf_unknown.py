@@ -9,8 +9,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from ...errors import shown
-from ..worlds import quote_labels
+from ...errors import quoted, shown
 from .xml_source import XmlElement
 
 JOINT = "name type origin parent child axis calibration dynamics limit mimic safety_controller dont_collapse"
@@ -30,7 +29,7 @@ KNOWN = {
     "child": "link",
 }
 """Children and attributes by tag; elements of other tags are not looked into."""
-MOST = 5  # different names that the warning shows
+MOST, NAMES = 10, 3  # that the warning shows: things, and joints or links with each
 
 
 def warn_of_unknown(file: Path, holders: Iterable[XmlElement]) -> None:
@@ -40,7 +39,7 @@ def warn_of_unknown(file: Path, holders: Iterable[XmlElement]) -> None:
         for words in dict.fromkeys(_unknown(holder)):
             found.setdefault(f"{words} of {holder.tag}s", []).append(str(holder.get("name")))
     if found:
-        parts = [f"{words} {quote_labels(names)}" for words, names in list(found.items())[:MOST]]
+        parts = [f"{words} {_listed(names)}" for words, names in list(found.items())[:MOST]]
         more = f", and {len(found) - MOST} more" if len(found) > MOST else ""
         warnings.warn(
             f"load: {str(file)!r}: left out, because URDF does not define it: {', '.join(parts)}{more}; correct the "
@@ -48,6 +47,11 @@ def warn_of_unknown(file: Path, holders: Iterable[XmlElement]) -> None:
             UserWarning,
             stacklevel=4,
         )
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - NAMES} more" if len(names) > NAMES else ""
+    return ", ".join(quoted(name) for name in names[:NAMES]) + more
 
 
 def _unknown(element: XmlElement) -> Iterator[str]:
