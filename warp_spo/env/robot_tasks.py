@@ -39,8 +39,10 @@ def robot_task(file: Path, robot: Path) -> str:
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # which the task says when it is trained
-        scene = load(robot, contacts=True)
-    reads = "contacts=True" if scene.contacts else ""
+        scene = load(robot, contacts="ground")
+    reads = 'contacts="ground"' if scene.contacts else ""
+    if len({_root(scene, hinge.child) for hinge in scene.hinges if hinge.dof_count}) > 1:
+        reads = "contacts=True"  # a robot and what it handles: bodies touch each other, too
     single = [i for i, hinge in enumerate(scene.hinges) if hinge.coord_count == hinge.dof_count == 1]
     if not single:
         raise ValueError(f"--robot {str(robot)!r}: has no joint of one coordinate; expected one or more to act on")
@@ -93,6 +95,13 @@ from warp_spo.env.settings import make_env
 ROBOT = {json.dumps(path)}  # from this file's folder; films and pages draw it, and play --mujoco runs it
 # Settings of PPO: --set learner.NAME=VALUE changes one for a training. On a GPU take 4096 worlds.
 LEARNER = Learner(iterations=300, worlds=512, steps=24, hidden=(128, 64))'''
+
+
+def _root(scene: Any, body: int) -> int:
+    """Return the body at the root of a body's tree."""
+    while (parent := scene.tree.parent[body]) >= 0:
+        body = parent
+    return body
 
 
 def _start(scene: Any, start: np.ndarray) -> str:
