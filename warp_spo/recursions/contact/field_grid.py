@@ -148,7 +148,7 @@ def _on_rim(
 ) -> tuple[Vector, Value, Vector]:
     """Return normal, depth and place where a rim of a cylinder is farthest below the plane of a cell."""
     rate_x, rate_y = (1.0 / size for size in ground.cells)
-    axis, up = shape.axes[2], facing((cell.run + 0.5 * cell.twist) * rate_x, (cell.rise + 0.5 * cell.twist) * rate_y)
+    axis, up = shape.axes[2], upward_normal((cell.run + 0.5 * cell.twist) * rate_x, (cell.rise + 0.5 * cell.twist) * rate_y)
     out = up - axis * dot(up, axis)
     square = dot(out, out)
     known = less(UPRIGHT, square)
@@ -156,7 +156,7 @@ def _on_rim(
     seat = axis * (end * shape.sizes[2]) - out * far
     at = shape.centre + seat
     s, t = at[0] * rate_x - i, at[1] * rate_y - j
-    normal = facing((cell.run + cell.twist * t) * rate_x, (cell.rise + cell.twist * s) * rate_y)
+    normal = upward_normal((cell.run + cell.twist * t) * rate_x, (cell.rise + cell.twist * s) * rate_y)
     height = cell.base + cell.run * s + cell.rise * t + cell.twist * (s * t)
     return normal, (height - at[2]) * normal[2] + shape.radius, seat - normal * shape.radius
 
