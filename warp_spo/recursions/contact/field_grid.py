@@ -148,7 +148,8 @@ def _on_rim(
 ) -> tuple[Vector, Value, Vector]:
     """Return normal, depth and place where a rim of a cylinder is farthest below the plane of a cell."""
     rate_x, rate_y = (1.0 / size for size in ground.cells)
-    axis, up = shape.axes[2], upward_normal((cell.run + 0.5 * cell.twist) * rate_x, (cell.rise + 0.5 * cell.twist) * rate_y)
+    axis = shape.axes[2]
+    up = upward_normal((cell.run + 0.5 * cell.twist) * rate_x, (cell.rise + 0.5 * cell.twist) * rate_y)
     out = up - axis * dot(up, axis)
     square = dot(out, out)
     known = less(UPRIGHT, square)
