@@ -16,12 +16,13 @@ NAME = "grid_search"
 RULES = {
     "OUTWARD": 1e-3, "TIE": 1e-6, "DOWN": 0.5, "ACROSS": 0.17, "BESIDE": 0.35, "SLACK": 0.5, "PARALLEL": 1e-6,
     "FAR": 1e30, "APART": 0.94 * 0.94, "ABOVE": 0.5, "STANDS": 0.7, "PI": math.pi,
-    "LEAN": math.tan(hull_corners.LEAN), "NEARER": 1.0 - 1e-6,
+    "LEAN": math.tan(hull_corners.LEAN), "NEARER": 1.0 - 1e-6, "UPRIGHT": 1e-8,
 }  # fmt: skip
 KINDS = {
     "QUADRANTS": 4,
     "SIDE": 3,
-    "RIM": 32,
+    "EDGES": 32,
+    "RIMS": 7,
     "POINT": 1,
     "LINE_Y": 2,
     "LINE_X": 3,
@@ -154,9 +155,10 @@ struct grid_search
         Best best;
         REAL slack;
         int u, v;
+        const REAL* sideways; // of a cylinder that lies: the horizontal direction across its axis, x and y
 
         CUDA_CALLABLE inline Polyhedron(const REAL* table, const REAL* asked, REAL* out)
-            : field(table, asked), best(out)
+            : field(table, asked), best(out), sideways(nullptr)
         {
             const REAL *c = field.centre, *A = field.axes, *half = field.sizes;
             slack = SLACK * least(least(half[0], half[1]), half[2]);
@@ -227,7 +229,10 @@ struct grid_search
                         && other[0] * x + other[1] * y + other[2] * up <= BESIDE;
                     if (!carries || on::absolute(rise) > 1 || up < DOWN
                         || depth > half - on::absolute(t) + slack) continue;
-                    REAL* row = best.take(depth, seat[u] + t * local[u], seat[v] + t * local[v]);
+                    const REAL over = sideways
+                        ? sideways[0] * (at[0] - c[0] + t * along[0]) + sideways[1] * (at[1] - c[1] + t * along[1])
+                        : seat[v] + t * local[v];
+                    REAL* row = best.take(depth, seat[u] + t * local[u], over);
                     if (!row) continue;
                     row[0] = f == 0 ? LINE_Y : LINE_X, row[1] = i, row[2] = j;
                     for (int x = 0; x < 3; ++x) row[3 + x] = local[x], row[6 + x] = seat[x];
@@ -322,14 +327,21 @@ struct grid_search
     static CUDA_CALLABLE inline void cylinder(const REAL* table, const REAL* asked, REAL* out)
     {
         const REAL radius = asked[13], half = asked[15], lean = asked[12];
-        if (on::absolute(lean) < STANDS) {
-            beside_axis(table, asked, SLACK * least(radius, half), SIDE, out);
-            return;
-        }
         Polyhedron shape(table, asked, out);
         if (shape.field.is_far()) return;
         const Field& field = shape.field;
-        const REAL down[3] = {0, 0, (REAL)(lean > 0 ? -1 : 1)};
+        if (on::absolute(lean) < STANDS) {
+            const REAL inverse = on::inverse_root(field.axes[6] * field.axes[6] + field.axes[7] * field.axes[7]);
+            const REAL sideways[2] = {-field.axes[7] * inverse, field.axes[6] * inverse};
+            beside_axis(field, shape.best, shape.slack, SIDE, sideways);
+            shape.u = 2, shape.sideways = sideways;
+            LOOP
+            for (int end = -1; end < 2; end += 2) rim(shape, radius, half, end);
+            lowest_on_rims(field, shape.best, sideways);
+            return;
+        }
+        const int end = lean > 0 ? -1 : 1;
+        const REAL down[3] = {0, 0, (REAL)end};
         LOOP
         for (int i = field.low[0]; i <= field.high[0]; ++i) {
             LOOP
@@ -340,38 +352,98 @@ struct grid_search
                 shape.take_point(i, j, q, half - down[2] * q[2], side, down, half);
             }
         }
+        rim(shape, radius, half, end);
+        lowest_on_rims(field, shape.best, nullptr);
+    }
+
+    // The edges of a cylinder's rim, at the end -1 or 1 of its axis.
+    static CUDA_CALLABLE inline void rim(Polyhedron& shape, REAL radius, REAL half, int end)
+    {
         REAL turn[2], share[2];
-        on::sincos(PI / RIM, share[1], share[0]);
+        const REAL face[3] = {0, 0, (REAL)end};
+        on::sincos(PI / EDGES, share[1], share[0]);
         LOOP
-        for (int edge = 0; edge < RIM; ++edge) {
-            on::sincos(2 * PI / RIM * edge, turn[1], turn[0]);
+        for (int edge = 0; edge < EDGES; ++edge) {
+            on::sincos(2 * PI / EDGES * edge, turn[1], turn[0]);
             const REAL out[3] = {turn[0], turn[1], 0}, local[3] = {-turn[1], turn[0], 0};
-            const REAL far = radius * share[0], seat[3] = {far * out[0], far * out[1], half * down[2]};
-            shape.cross(seat, local, radius * share[1], out, down);
+            const REAL far = radius * share[0], seat[3] = {far * out[0], far * out[1], half * face[2]};
+            shape.cross(seat, local, radius * share[1], out, face);
+        }
+    }
+
+    // Where a rim of a cylinder is farthest below the plane of a cell, if that is in the cell and no wall;
+    // ``sideways``: the horizontal direction across its axis if it lies.
+    static CUDA_CALLABLE inline void lowest_on_rims(const Field& field, Best& best, const REAL* sideways)
+    {
+        const REAL *c = field.centre, *A = field.axes, *axis = A + 6, radius = field.sizes[0], half = field.sizes[2];
+        const bool lies = sideways != nullptr;
+        int first[2], last[2];
+        for (int f = 0; f < 2; ++f) {
+            REAL reach = 0;
+            for (int k = 0; k < 3; ++k) reach += on::absolute(A[3 * k + f]) * field.sizes[k];
+            field.between(c[f] - reach, c[f] + reach, f, true, first[f], last[f]);
+        }
+        LOOP
+        for (int i = first[0]; i < last[0]; ++i) {
+            LOOP
+            for (int j = first[1]; j < last[1]; ++j) {
+                const REAL* h = field.cells + 4ll * (i * field.count[1] + j);
+                const REAL run = h[2] - h[0], rise = h[1] - h[0], twist = h[0] - h[1] - h[2] + h[3];
+                const REAL x = (run + twist / 2) / field.cell[0], y = (rise + twist / 2) / field.cell[1];
+                if (x * x + y * y > 1) continue;
+                const REAL up = on::inverse_root(1 + x * x + y * y);
+                const REAL n[3] = {-x * up, -y * up, up};
+                const REAL along = field.along(2, n[0], n[1], n[2]);
+                REAL out[3], square = 0;
+                for (int x = 0; x < 3; ++x) {
+                    out[x] = n[x] - along * axis[x];
+                    square += out[x] * out[x];
+                }
+                const REAL far = square > UPRIGHT ? radius * on::inverse_root(square) : (REAL)0;
+                LOOP
+                for (int end = -1; end < 2; end += 2) {
+                    if (!lies && (axis[2] > 0) == (end > 0)) continue;
+                    REAL at[3];
+                    for (int x = 0; x < 3; ++x) at[x] = end * half * axis[x] - far * out[x];
+                    const REAL s = (c[0] + at[0]) / field.cell[0] - i, t = (c[1] + at[1]) / field.cell[1] - j;
+                    if (!(s >= 0 && s <= 1 && t >= 0 && t <= 1)) continue;
+                    const REAL a = (run + twist * t) / field.cell[0], b = (rise + twist * s) / field.cell[1];
+                    const REAL height = h[0] + run * s + rise * t + twist * (s * t);
+                    const REAL depth = (height - c[2] - at[2]) * on::inverse_root(1 + a * a + b * b);
+                    const REAL u = lies ? end * half : field.along(0, at[0], at[1], at[2]);
+                    const REAL v = lies ? sideways[0] * at[0] + sideways[1] * at[1]
+                                        : field.along(1, at[0], at[1], at[2]);
+                    REAL* row = best.take(depth, u, v);
+                    if (!row) continue;
+                    row[0] = RIMS, row[1] = i, row[2] = j, row[3] = end;
+                    for (int x = 4; x < ROW; ++x) row[x] = 0;
+                }
+            }
         }
     }
 
     static CUDA_CALLABLE inline void capsule(const REAL* table, const REAL* asked, REAL* out)
     {
-        beside_axis(table, asked, 0, 0, out);
+        const Field field(table, asked);
+        Best best(out);
+        if (!field.is_far()) beside_axis(field, best, 0, 0, nullptr);
     }
 
-    // ``kind`` is SIDE for a cylinder, which has faces at the ends of its axis, else 0.
-    static CUDA_CALLABLE inline void beside_axis(const REAL* table, const REAL* asked, REAL slack, int kind, REAL* out)
+    // ``kind`` is SIDE for a cylinder, which has faces at the ends of its axis, else 0; ``sideways``: as for rims.
+    static CUDA_CALLABLE inline void beside_axis(
+        const Field& field, Best& best, REAL slack, int kind, const REAL* sideways)
     {
-        Field field(table, asked);
-        Best best(out);
-        if (field.is_far()) return;
         const REAL *c = field.centre, *axis = field.axes + 6;
         const REAL radius = field.sizes[0], half = field.sizes[2];
+        int low[2], high[2];
         for (int f = 0; f < 2; ++f) {
             const REAL reach = on::absolute(axis[f]) * half + radius;
-            field.between(c[f] - reach, c[f] + reach, f, true, field.low[f], field.high[f]);
+            field.between(c[f] - reach, c[f] + reach, f, true, low[f], high[f]);
         }
         LOOP
-        for (int i = field.low[0]; i <= field.high[0]; ++i) {
+        for (int i = low[0]; i <= high[0]; ++i) {
             LOOP
-            for (int j = field.low[1]; j <= field.high[1]; ++j) {
+            for (int j = low[1]; j <= high[1]; ++j) {
                 const REAL w[3] = {c[0] - i * field.cell[0], c[1] - j * field.cell[1], c[2] - field.height(i, j)};
                 const REAL along = field.along(2, w[0], w[1], w[2]);
                 LOOP
@@ -403,7 +475,8 @@ struct grid_search
                     const bool side = away[2] >= DOWN * distance
                         && radius - distance <= half - on::absolute(t) + slack;
                     if (outside && !(kind ? side : away[2] > 0)) continue;
-                    REAL* row = best.take(-distance, t, 0);
+                    const REAL v = kind ? -(sideways[0] * away[0] + sideways[1] * away[1]) : (REAL)0;
+                    REAL* row = best.take(kind ? radius - distance : -distance, t, v);
                     if (!row) continue;
                     row[0] = kind; // of the side, or none
                     row[0] += f < 0 ? POINT : f == 0 ? LINE_Y : LINE_X, row[1] = i, row[2] = j;

@@ -1,4 +1,4 @@
-"""Boxes and capsules on height fields against truths: dense sampling of both surfaces; a foot on a stair; a ridge.
+"""Shapes on height fields against truths: dense sampling of both surfaces; a foot on a stair; a ridge.
 
     python -m benchmarks.contact.uneven [NAME ...] [--count 500] [--json FILE]
 
@@ -71,7 +71,52 @@ def capsule(radius: float = 0.04, half: float = 0.12) -> Sampled:
     return Sampled(dict(capsule=((-half, 0, 0), (half, 0, 0), radius)), np.concatenate(rings), inside)
 
 
-SHAPES = {"box": box(), "capsule": capsule()}
+def cylinder(radius: float, half: float) -> Sampled:
+    """Return a cylinder along z; its side is sampled along lines, its faces at their rims alone."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 360, endpoint=False)
+    ring = radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    cloud = [np.column_stack([ring, np.full(360, z)]) for z in np.linspace(-half, half, 5)]
+
+    def inside(q: np.ndarray) -> np.ndarray:
+        return np.minimum(radius - np.linalg.norm(q[..., :2], axis=-1), half - np.abs(q[..., 2]))
+
+    return Sampled(dict(cylinder=((0, 0, -half), (0, 0, half), radius)), np.concatenate(cloud), inside)
+
+
+def roller(radius: float = 0.04, half: float = 0.12) -> Sampled:
+    """Return a cylinder along x."""
+    upright = cylinder(radius, half)
+    contact = dict(cylinder=((-half, 0, 0), (half, 0, 0), radius))
+    return Sampled(contact, upright.cloud[:, [2, 0, 1]], lambda q: upright.inside(q[..., [1, 2, 0]]))
+
+
+def hull(half: tuple[float, ...] = HALF) -> Sampled:
+    """Return a prism of twelve corners, with an oblong hexagon above another."""
+    turn = np.pi / 3.0 * np.arange(6)
+    ring = np.stack([np.cos(turn), np.sin(turn)], axis=1) * half[:2]
+    corners = np.array([[*at, z] for z in (-half[2], half[2]) for at in ring])
+    ends = [(a, (a + 1) % 6) for a in range(6)]
+    edges = [*ends, *((a + 6, b + 6) for a, b in ends), *((a, a + 6) for a in range(6))]
+    along = np.linspace(0.0, 1.0, 101)[:, None]
+    cloud = np.concatenate([corners[a] + along * (corners[b] - corners[a]) for a, b in edges])
+    across = np.array([(ring[b] - ring[a])[::-1] * (1.0, -1.0) for a, b in ends])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    offsets = (across * ring).sum(axis=1)
+
+    def inside(q: np.ndarray) -> np.ndarray:
+        sides = (offsets - q[..., :2] @ across.T).min(axis=-1)
+        return np.minimum(sides, half[2] - np.abs(q[..., 2]))
+
+    return Sampled(dict(hull=corners), cloud, inside)
+
+
+SHAPES = {
+    "box": box(),
+    "capsule": capsule(),
+    "disc": cylinder(radius=0.1, half=0.02),
+    "roller": roller(),
+    "hull": hull(),
+}
 
 
 def turned(rng: np.random.Generator, most: float) -> np.ndarray:

@@ -78,6 +78,7 @@ def test_ranges_of_commands_and_events_follow_the_level():
             events.randomise("body_mass", Curriculum((1.0, 1.0), (2.0, 3.0), ByStep(8)), when="reset", alike=True),
         ],
     )  # fmt: skip
+    assert env.command_ranges == {"command 0": (0.0, 11.0)}
     for step in range(1, 21):
         env.step(zeros(env))
         share = np.clip((step - 5) / 10, 0.0, 1.0)

@@ -52,6 +52,21 @@ def test_the_policy_is_read_whole(tmp_path):
     assert there.last.shape == (2, 12) and there.last.any()
 
 
+@pytest.mark.parametrize("ranges, low, high", [
+    ([[-0.5, 0.1], [0.0, 0.0], [-2.0, 2.0]], [-0.5, 0.0, -0.8], [0.1, 0.0, 0.8]),
+    (None, [-0.8] * 3, [0.8] * 3),  # of older files
+])  # fmt: skip
+def test_trials_ask_for_what_was_trained(tmp_path, ranges, low, high):
+    """Commands fill the ranges of the policy's training, as far as they are within 0.8 m/s and 0.8 rad/s."""
+    there, asked = deploy(tmp_path, policy(command_ranges=ranges)), []
+    there.step = lambda: asked.append(there.commands.copy())
+    step = there.metadata["dt"] * there.metadata["decimation"]
+    deployment.trial(there, seconds=200 * step, period=step, still=0.0)
+    found = np.concatenate(asked)
+    assert (found >= low).all() and (found <= high).all()
+    np.testing.assert_allclose([found.min(axis=0), found.max(axis=0)], [low, high], atol=0.02)
+
+
 def test_torn_files(tmp_path):
     whole = policy().SerializeToString()
     for size in (0, 1, 30, len(whole) // 3, len(whole) // 2, len(whole) - 1):
@@ -102,6 +117,8 @@ def test_operators(tmp_path):
         (dict(decimation=0), "'decimation'"),
         (dict(dt=-1.0), "'dt'"),
         (dict(observations=[["joint position"]]), "'observations'"),
+        (dict(command_ranges=[[1.0, -1.0]]), "'command_ranges'"),
+        (dict(command_ranges=7), "'command_ranges'"),
     ],
 )
 def test_metadata(tmp_path, metadata, words):

@@ -38,15 +38,25 @@ def new_file(text, folder, name="robot"):
 
 @pytest.mark.filterwarnings("ignore:load")
 def test_a_robot_stands_where_its_file_has_it(tmp_path):
-    """The start is MuJoCo's qpos0; a wheel's angle is not observed, its motor has its range, and films its file."""
+    """The start is MuJoCo's qpos0; a file without a floor has the plane z = 0 as one, an arm none."""
     chosen = task(str(new_file(BALANCER, tmp_path)))
     qpos = mujoco.MjModel.from_xml_string(BALANCER).qpos0
     np.testing.assert_allclose(chosen.START, [*qpos[:3], *np.roll(qpos[3:7], -1), *qpos[7:]], atol=1e-6)
-    env = chosen.build(4, "cpu")
+    assert (tmp_path / chosen.ROBOT).is_file()
+    floorless = BALANCER.replace('<geom type="plane" size="0 0 .1"/>', "")
+    for text, reads in ((BALANCER, 'ROBOT, contacts="ground")'), (floorless, 'ROBOT, contacts="*")'), (ARM, "ROBOT)")):
+        file = new_file(text, tmp_path, f"robot_{len(reads)}")
+        assert f"spo.load(Path(__file__).parent / {reads}" in file.read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:load")
+def test_wheels_have_their_motors_and_no_angle(tmp_path):
+    """A wheel's angle is not observed, and the actions from -1 to 1 are the range of its motor."""
+    env = task(str(new_file(BALANCER, tmp_path))).build(4, "cpu")
     assert env.num_obs == {"actor": 3 * 3 + 2 + 2 + 3} and env.num_actions == 2  # rates, base; command
     np.testing.assert_allclose(env.controls(torch.ones(4, 2))["ctrl"].cpu(), 3.0)  # the highest control
     np.testing.assert_allclose(env.controls(-torch.ones(4, 2))["ctrl"].cpu(), -1.0)
-    assert (tmp_path / chosen.ROBOT).is_file()
 
 
 def test_an_arm_starts_from_its_keyframe(tmp_path):

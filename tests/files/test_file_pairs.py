@@ -409,6 +409,33 @@ def test_pairs_that_cannot_be_are_errors(pairs, error, words):
         quiet(spo.load, shipped("ant"), contacts="ground", pairs=pairs)
 
 
+STAGE = """#usda 1.0
+(
+    metersPerUnit = 1
+    upAxis = "Z"
+)
+def PhysicsScene "s" {{}}
+{}
+def Cube "table" ( prepend apiSchemas = ["PhysicsCollisionAPI"] ) {{
+  double size = 1
+}}
+"""
+MARBLE = """def Sphere "b{0}" ( prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI",
+  "PhysicsFilteredPairsAPI"] ) {{
+  double radius = 0.1
+  float physics:mass = 1
+  {1}
+}}
+"""
+
+
+def test_filtered_pairs_of_usd_do_not_touch(tmp_path):
+    file = tmp_path / "marbles.usda"
+    file.write_text(STAGE.format(MARBLE.format(0, "rel physics:filteredPairs = </b1>") + MARBLE.format(1, "")))
+    scene = spo.load(file, contacts=True, ground=spo.Plane(-1.0))
+    assert {contact.label for contact in scene.contacts} == {"/b0", "/b1", "/b0 with /table", "/b1 with /table"}
+
+
 # -- steps -------------------------------------------------------------------------------------------------------------
 STACK = f"""<mujoco><worldbody><geom type="plane" size="1 1 1"/>{
     "".join(

@@ -197,3 +197,20 @@ def test_a_base_that_an_actuator_drives_stays(tmp_path):
     with pytest.raises(spo.UnsupportedError, match="actuator 'm', which needs joint 'lift', under floating="):
         spo.load(file, floating=False)
     assert spo.load(file).actuators[0].hinges == (0,)
+
+
+def test_bodies_begin_where_the_file_has_them(tmp_path):
+    """MuJoCo's places of bodies at qpos0: two free bodies, one of them turned, and a joint with a reference."""
+    free = '<body pos="{}" quat="{}"><freejoint/><geom size=".1" pos=".02 0 0"/></body>'
+    arm = '<body pos="1 0 0"><joint axis="0 1 0" ref="30"/><geom size=".1" pos=".3 0 0"/></body>'
+    world = free.format("0 0 .5", "1 0 0 0") + arm + free.format("0 2 .7", ".6 .8 0 0")
+    file = written(tmp_path, world=world)
+    model, scene = mujoco.MjModel.from_xml_path(str(file)), spo.load(file)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    poses = spo.Dynamics(scene, granularity="node", dtype="float64").body_poses(scene.initial_q[None])[0]
+    assert np.abs(poses[:, :3] - data.xpos[1:]).max() < EXACT
+    assert np.abs(poses[:, [6, 3, 4, 5]] - data.xquat[1:]).max() < EXACT
+    for copy in (scene.with_values(gravity=[0, 0, -1]), scene.with_contacts([spo.Contact(0, [0, 0, 0])])):
+        assert (copy.initial_q == scene.initial_q).all()
+    assert (spo.from_mujoco(model).initial_q == scene.initial_q).all()

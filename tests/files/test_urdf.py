@@ -231,6 +231,42 @@ def test_limits_that_stop_a_joint_are_named_once(tmp_path):
         scene.with_values(**{f"joint_{name}": np.full(scene.dof_count, -1e6 if "lower" in name else 1e6)})
 
 
+UNKNOWN = (
+    """<dynamics damping="1" armature="3" spring_stiffness="4"/><limits lower="-1"/><mimic joint="j" multiply="2"/>"""
+)
+
+
+def test_what_urdf_does_not_define_is_named_once(tmp_path):
+    """Misspelt attributes and elements of a joint and a link; hints and names of shapes are not among them."""
+    parts = pair("revolute", '<limit lower="-1" upper="1" efort="3" velocity="1" acceleration="9"/><drake:rotor/>')
+    parts[0] = parts[0].replace("<inertial>", '<gravity>0</gravity><visual odd="1"/><inertial density="3">')
+    more = [
+        LINK.format("c"),
+        JOINT.format("k", "revolute", "b", "c", UNKNOWN).replace("<joint", '<joint dont_collapse="1"'),
+    ]
+    with pytest.warns(UserWarning, match="left out") as caught:
+        load(written(tmp_path, robot(*parts, *more)))
+    said = [str(one.message) for one in caught]
+    words = [
+        *("'efort' of <limit> of joints 'j'", "'acceleration' of <limit> of joints 'j'", "<drake:rotor> of joints 'j'"),
+        *("'armature' of <dynamics> of joints 'k'", "'spring_stiffness' of <dynamics> of joints 'k'"),
+        *("<limits> of joints 'k'", "'multiply' of <mimic> of joints 'k'"),
+        *("<gravity> of links 'a'", "'density' of <inertial> of links 'a'"),
+    ]
+    assert len(said) == 1 and all(one in said[0] for one in words), said
+    assert said[0].count(" of joints ") + said[0].count(" of links ") == len(words) and "scene.with_values" in said[0]
+    long = [LINK.format("a"), *(f'<link name="{i}{"x" * 70_000}" {"y" * 70_000}{i}="1"/>' for i in range(99))]
+    tied = [JOINT.format(i, "revolute", "a", f"{i}{'x' * 70_000}", "<o/>") for i in range(99)]
+    with pytest.warns(
+        UserWarning, match=r"<o> of joints '0', '1', '2' and 96 more, .*, and 90 more; correct"
+    ) as caught:
+        load(written(tmp_path, robot(*long, *tied)), repair=False)
+    assert len(str(caught[0].message)) < 4000
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load(written(tmp_path, robot(*pair("revolute", LIMIT))))
+
+
 def test_a_mimic_of_no_joint_is_left_out_with_a_warning(tmp_path):
     path = written(tmp_path, robot(*pair("revolute", '<mimic joint="x"/>')))
     with pytest.warns(UserWarning, match="line 4: joint 'j' mimics 'x', which is no joint of the file"):

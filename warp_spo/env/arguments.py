@@ -77,8 +77,8 @@ def check_times(dt: Any, decimation: Any, episode_length_s: Any) -> tuple[float,
 
 
 def check_default(scene: Scene, default_q: Any) -> np.ndarray:
-    """Return the coordinates that episodes start from [coordinate]; the scene's neutral ones for None."""
-    default = np.asarray(scene.neutral_q if default_q is None else default_q, dtype=np.float64)
+    """Return the coordinates that episodes start from [coordinate]; the scene's initial ones for None."""
+    default = np.asarray(scene.initial_q if default_q is None else default_q, dtype=np.float64)
     if default.shape != (scene.coord_count,):
         raise ValueError(f"Env: default_q has shape {default.shape}; expected ({scene.coord_count},) [coordinate]")
     if not np.isfinite(default).all():

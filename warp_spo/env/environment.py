@@ -31,6 +31,7 @@ from .compile.fused_kernel import Launch
 from .compile.guard import Guard
 from .compile.memory_layout import MemoryLayout
 from .compile.step_kernels import Tracing
+from .curricula import ends_of
 from .episode_log import Log, describe, explain
 from .events import Delays, Values, changed_values
 from .failures import FailureRing
@@ -266,10 +267,14 @@ class Env(VecEnv):
 
     @property
     def command_ranges(self) -> dict[str, tuple[float, float]]:
-        """Ranges of the numbers of a command by name; -1 to 1 for commands of one's own without ``ranges_by_name``."""
+        """Ranges of the numbers of a command by name; -1 to 1 for commands of one's own without ``ranges_by_name``.
+
+        Of a curriculum, from the lowest to the highest of both its ranges.
+        """
         commands = self._layout.commands
         plain = {f"command {i}": (-1.0, 1.0) for i in range(commands.size if self.has_commands else 0)}
-        return {name: (float(a), float(b)) for name, (a, b) in getattr(commands, "ranges_by_name", plain).items()}
+        ends = {name: np.array(ends_of(each)) for name, each in getattr(commands, "ranges_by_name", plain).items()}
+        return {name: (float(each.min()), float(each.max())) for name, each in ends.items()}
 
     # -- stepping --------------------------------------------------------------------------------------------------
     def get_observations(self) -> Any:

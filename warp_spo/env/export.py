@@ -35,7 +35,7 @@ def describe(env: Env, name: str) -> dict[str, Any]:
     ``default_position``; they are of all joints unless the term names some. ``stride`` is the period [s] of the
     observation "step phase", None without one: sine and cosine of 2 pi time / stride, zeros while speed and turning
     asked for add up to 0.05 m/s and rad/s at most. ``default_base`` is where a floating base starts, position and
-    quaternion (xyzw), None of a fixed one.
+    quaternion (xyzw), None of a fixed one. ``command_ranges`` has (lowest, highest) of each number of a command.
     """
     chosen, scene = task(name) if name in TASKS else None, env.scene
     scale, offset, gains = controls_of(env)
@@ -60,6 +60,7 @@ def describe(env: Env, name: str) -> dict[str, Any]:
         "observation_clip": [term.clip for _, _, term in seen],
         "observation_history": [term.history for _, _, term in seen],
         "default_base": env.default_q[:7].tolist() if floats else None,
+        "command_ranges": list(map(list, env.command_ranges.values())),
     }
 
 

@@ -95,9 +95,7 @@ def make_vector(env: Env, tensors: bool = False, autoreset_mode: Any = "SameStep
             copies, given = checkpoint.copy_worlds(env, waiting) if len(waiting) else {}, given.to(env.device)
             if len(waiting) and given.shape == (env.num_envs, env.num_actions):
                 given = given.clone()
-                given[waiting] = (
-                    0.0  # their steps are taken back; other actions might fail, and leave files of failures
-                )
+                given[waiting] = 0.0  # taken back; other actions might fail, and leave files of failures
             observed, rewards, done, extras = env.step(given)
             ends, late = done.bool(), extras["time_outs"].bool()
             log = extras.get("log", {})

@@ -1,4 +1,4 @@
-"""A task's file to start from, for a robot: ``python -m warp_spo.tasks --new FILE.py --robot ROBOT.xml``."""
+"""Files of tasks for a robot of one's own: ``python -m warp_spo.tasks --new FILE.py --robot ROBOT.xml``."""
 
 from __future__ import annotations
 
@@ -36,23 +36,26 @@ def robot_task(file: Path, robot: Path) -> str:
             "training has the way from one"
         )
     from .. import load
-    from ..mujoco.mjcf import initial_q
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # which the task says when it is trained
-        scene = load(robot, contacts=True)
-        start = initial_q(robot)
+        scene = load(robot, contacts="ground")
+    reads = 'contacts="ground"' if scene.contacts else ""
+    if len({_root(scene, hinge.child) for hinge in scene.hinges if hinge.dof_count}) > 1:
+        reads = "contacts=True"  # a robot and what it handles: bodies touch each other, too
     single = [i for i, hinge in enumerate(scene.hinges) if hinge.coord_count == hinge.dof_count == 1]
     if not single:
         raise ValueError(f"--robot {str(robot)!r}: has no joint of one coordinate; expected one or more to act on")
     floats = any(hinge.kind == "free" and hinge.parent == -1 for hinge in scene.hinges)
+    if floats and not reads:
+        reads = 'contacts="*"'  # of a file without a floor: all shapes, on the plane z = 0
     endless = _endless(scene, single)
     name = os.path.relpath(robot.resolve(), file.resolve().parent)
     return "\n".join([
         _head(shown(robot.stem), name, file, floats),
-        _start(scene, start),
+        _start(scene, scene.initial_q),
         *([] if floats or not endless else [_angles(endless)]),
-        _build(scene, single, endless, floats),
+        _build(scene, single, endless, floats, reads),
     ])  # fmt: skip
 
 
@@ -92,6 +95,13 @@ from warp_spo.env.settings import make_env
 ROBOT = {json.dumps(path)}  # from this file's folder; films and pages draw it, and play --mujoco runs it
 # Settings of PPO: --set learner.NAME=VALUE changes one for a training. On a GPU take 4096 worlds.
 LEARNER = Learner(iterations=300, worlds=512, steps=24, hidden=(128, 64))'''
+
+
+def _root(scene: Any, body: int) -> int:
+    """Return the body at the root of a body's tree."""
+    while (parent := scene.tree.parent[body]) >= 0:
+        body = parent
+    return body
 
 
 def _start(scene: Any, start: np.ndarray) -> str:
@@ -137,7 +147,7 @@ def _text(x: float) -> str:
     return repr(float(f"{x:.6g}"))
 
 
-def _build(scene: Any, single: list[int], endless: list[str], floats: bool) -> str:
+def _build(scene: Any, single: list[int], endless: list[str], floats: bool, reads: str) -> str:
     action, meaning = _action(scene)
     limited = [label for i in single if (label := scene.joint_labels[i]) not in endless]
     seen = ["observations.base_velocity", "observations.base_angular_velocity", "observations.projected_gravity"]
@@ -168,7 +178,7 @@ def _build(scene: Any, single: list[int], endless: list[str], floats: bool) -> s
 
 def build(worlds, device=None, seed=0, **options):
     """Return the environment; what make_env gets by name, --set changes."""
-    scene = spo.load(Path(__file__).parent / ROBOT, contacts=True){loops}
+    scene = spo.load(Path(__file__).parent / ROBOT{reads and f", {reads}"}){loops}
     return make_env(
         scene, worlds, device, options, seed=seed, dt=5e-3, decimation=4, default_q={pose},
         episode_length_s=10.0,

@@ -175,7 +175,7 @@ COMMENTS = (
     (
         "def build",
         "# Makes the environment. In place of robots.load take spo.load(FILE) with .with_contacts(...), and its\n"
-        "# neutral_q as default_q. A reward is (weight, term); a term is a function of one world. What make_env gets\n"
+        "# initial_q as default_q. A reward is (weight, term); a term is a function of one world. What make_env gets\n"
         "# by name, --set changes; a parameter of build() of your own, too.\n",
     ),
     ("def measure", "# What play --measure prints; without it the means of rewards and of lengths of episodes.\n"),

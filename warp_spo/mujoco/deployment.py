@@ -244,6 +244,9 @@ def check_metadata(file: str | Path, found: dict[str, Any]) -> None:
         raise _unread(file, f"has 'delay_steps' or 'decimation' that are not whole numbers up to {MOST_STEPS}")
     if not _is_number(found.get("dt")) or found["dt"] <= 0.0:
         raise _unread(file, "has no step 'dt' above zero in its metadata")
+    ranges = found.get("command_ranges") or []  # none in older files
+    if not isinstance(ranges, list) or not all(map(_is_range, ranges)):
+        raise _unread(file, "has 'command_ranges' that are no list of (lowest, highest) in its metadata")
     listed = found.get("observations", "")
     if (
         not isinstance(listed or [], list)
@@ -254,6 +257,10 @@ def check_metadata(file: str | Path, found: dict[str, Any]) -> None:
         )
     ):
         raise _unread(file, "has no list of 'observations' with a name, a size and a scale each in its metadata")
+
+
+def _is_range(value: Any) -> bool:
+    return isinstance(value, list | tuple) and len(value) == 2 and all(map(_is_number, value)) and value[0] <= value[1]
 
 
 def _is_number(value: Any) -> bool:
@@ -267,15 +274,18 @@ def _unread(file: str | Path, what: str) -> ValueError:
 def trial(deployment: Deployment, seconds: float = 20.0, period: float = 5.0, still: float = 1.0) -> dict[str, float]:
     """Walk with random commands of up to 0.8 m/s and 0.8 rad/s, new ones every ``period`` [s].
 
+    They are within the ranges of the training, which the policy's file has: what was never asked for may be anything.
+
     Returns:
         worlds, how many still stand at the end; mean errors of velocity [m/s] and turning [rad/s] of those; how many
         stand with a mean error of at most 0.3 m/s. ``still``: time after a new command that does not count [s].
     """
     step = deployment.metadata["dt"] * deployment.metadata["decimation"]
     errors, every = [], round(period / step)
+    low, high = np.clip(deployment.metadata.get("command_ranges") or [(-0.8, 0.8)] * 3, -0.8, 0.8).T
     for i in range(round(seconds / step)):
         if i % every == 0:
-            deployment.commands = deployment.random.uniform(-0.8, 0.8, deployment.commands.shape)
+            deployment.commands = deployment.random.uniform(low, high, deployment.commands.shape)
         deployment.step()
         if i % every >= round(still / step):
             off = deployment.velocities() - deployment.commands

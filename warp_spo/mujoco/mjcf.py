@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
-import numpy as np
 
 from ..errors import shown
 from ..scene.collision_shapes import NONE, ShapeSelection
 from ..scene.scene import Scene
 from .expansion import check_expansion
-from .mechanism import Mechanism
-from .model import scene_of, state_of
+from .model import scene_of
 from .source import Source
 
 
@@ -35,13 +33,6 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool = True, selection:
     source = Source(model, "load", str(file), missing)
     source.left_out += dropped
     return scene_of(source, floating, selection)
-
-
-def initial_q(file: Path) -> np.ndarray:
-    """Return the coordinates at which an MJCF file stands, MuJoCo's qpos0, of its scene [coordinate]."""
-    model, *_ = compiled(file)
-    source = Source(model, "load", str(file), {})
-    return state_of(source, Mechanism(source), model.qpos0, np.zeros(model.nv))[0]
 
 
 def compiled(file: Path) -> tuple[mujoco.MjModel, list[str], dict[int, str]]:

@@ -107,6 +107,7 @@ def _scene(source: Source, mechanism: Mechanism) -> Scene:
         actuators=read_actuators(source, mechanism),
         sites=_sites(source),
         keyframes=_keyframes(source, mechanism),
+        initial_q=state_of(source, mechanism, source.model.qpos0, np.zeros(source.model.nv))[0],
     )
 
 

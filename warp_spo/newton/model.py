@@ -73,8 +73,10 @@ def from_newton(
     loop_labels = worlds.labels(model.joint_label, worlds.loops)
     loops = [Loop(**worlds.edge(joint), label=label) for joint, label in zip(worlds.loops[0], loop_labels, strict=True)]
     couplings = [Coupling(int(h), int(r), ratio=float(c[1]), offset=float(c[0])) for h, r, c in worlds.couplings()]
+    start = to_numpy(model, "joint_q")[q_index[0]].astype(np.float64)
+    start = start if np.isfinite(start).all() else None  # a model may be finalized before it has a state
     try:
-        scene = Scene(bodies, hinges, values["gravity"][0], loops, couplings)
+        scene = Scene(bodies, hinges, values["gravity"][0], loops, couplings, initial_q=start)
     except DirectedLoopError as error:
         names = quote_labels([bodies[body].label for body in error.cycle])
         raise DirectedLoopError(f"from_newton, the joints of bodies {names}", error.cycle) from None

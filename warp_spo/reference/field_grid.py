@@ -16,7 +16,8 @@ from .field_spheres import find_cells
 
 ROW = 9  # numbers of a row: its kind, i, j of a grid point, a direction and a place on the shape, in its axes
 NONE, POINT, LINE_Y, LINE_X = 0.0, 1.0, 2.0, 3.0  # kinds: a grid point; from there a line along y, or along x
-SIDE = 3.0  # added to the kinds of what the side of a cylinder touches
+SIDE, RIMS = 3.0, 7.0  # added to the kinds of what the side of a cylinder touches; kind of a place on a rim
+UPRIGHT = 1e-8  # square of the sine below which a face is parallel to a cell, and no place on its rim is the lowest
 QUADRANTS, RIM = 4, 32
 STANDS = 0.7  # cosine of the lean up to which a cylinder stands
 OUTWARD, TIE = 1e-3, 1e-6  # share of the distance from the middle that counts as depth; what is as deep [m]
@@ -122,14 +123,20 @@ def _polyhedron(field, cell, centre, axes, reach, slack, faces, edges, round_by=
             side = min(side, round_by - np.sqrt(q[0] * q[0] + q[1] * q[1]))
             if np.isfinite(depth) and side >= 0.0 and depth <= side + slack:
                 found.append((depth, q[u], q[v], [POINT, i, j, *out, *(faces[best][1] * out)]))
+    return found + _edges(field, cell, centre, axes, slack, edges, lambda q: (q[u], q[v]))
+
+
+def _edges(field, cell, centre, axes, slack, edges, sides):
+    """Return the candidates where grid lines cross edges; ``sides``: returns what tells the quadrant of a place."""
+    found = []
     for seat, along, half, *both in edges:
         if min(normal @ axes[:, 2] for normal in both) <= -DOWN:
             for f in (0, 1):
-                found += _crossings(field, cell, centre, axes, seat, along, half, both, f, slack, u, v)
+                found += _crossings(field, cell, centre, axes, seat, along, half, both, f, slack, sides)
     return found
 
 
-def _crossings(field, cell, centre, axes, seat, local, half, both, f, slack, u, v):
+def _crossings(field, cell, centre, axes, seat, local, half, both, f, slack, sides):
     """Return the candidates where lines at constant x (``f`` 0) or y cross an edge."""
     at, along = centre + axes.T @ seat, axes.T @ local
     o, across, found = 1 - f, along[f], []
@@ -154,24 +161,79 @@ def _crossings(field, cell, centre, axes, seat, local, half, both, f, slack, u, 
         carries = all(normal @ (axes @ n) <= BESIDE for normal in both)
         if abs(rise) <= 1.0 and up >= DOWN and carries and depth <= half - abs(t) + slack:
             q = seat + t * local
-            found.append((depth, q[u], q[v], [LINE_Y if f == 0 else LINE_X, i, j, *local, *seat]))
+            found.append((depth, *sides(q), [LINE_Y if f == 0 else LINE_X, i, j, *local, *seat]))
     return found
 
 
 def _cylinder(field, cell, centre, axes, sizes, table):
     radius, _, half = sizes
     slack = SLACK * sizes.min()
+    rims = _rims(field, cell, centre, axes, sizes)
     if abs(axes[2, 2]) < STANDS:
-        return _choose(_beside_axis(field, cell, centre, axes[2], radius, half, slack))
-    down, share = np.array([0.0, 0.0, -1.0 if axes[2, 2] > 0.0 else 1.0]), np.pi / RIM
-    edges = []
+        across = _across(axes[2])
+        beside = _beside_axis(field, cell, centre, axes[2], radius, half, slack, across)
+        edges = [edge for end in (-1.0, 1.0) for edge in _rim_edges(radius, half, end)]
+        sides = lambda q: (q[2], across @ (axes.T @ q))  # noqa: E731
+        return _choose([*beside, *_edges(field, cell, centre, axes, slack, edges, sides), *rims])
+    end = -1.0 if axes[2, 2] > 0.0 else 1.0
+    face, edges = (np.array([0.0, 0.0, end]), half), _rim_edges(radius, half, end)
+    found = _polyhedron(field, cell, centre, axes, np.abs(axes.T) @ sizes, slack, [face], edges, radius)
+    return _choose([*found, *rims])
+
+
+def _rim_edges(radius, half, end):
+    """Return the edges of a rim, see _polyhedron."""
+    edges, share, face = [], np.pi / RIM, np.array([0.0, 0.0, end])
     for n in range(RIM):
         cos, sin = np.cos(2.0 * share * n), np.sin(2.0 * share * n)
         out = np.array([cos, sin, 0.0])
-        seat = radius * np.cos(share) * out + half * down
-        edges.append((seat, np.array([-sin, cos, 0.0]), radius * np.sin(share), out, down))
-    found = _polyhedron(field, cell, centre, axes, np.abs(axes.T) @ sizes, slack, [(down, half)], edges, radius)
-    return _choose(found)
+        seat = radius * np.cos(share) * out + half * face
+        edges.append((seat, np.array([-sin, cos, 0.0]), radius * np.sin(share), out, face))
+    return edges
+
+
+def _across(axis):
+    """Return the horizontal direction across an axis that lies [3]."""
+    across = np.array([-axis[1], axis[0], 0.0])
+    return across / np.sqrt(across @ across)
+
+
+def _rims(field, cell, centre, axes, sizes):
+    """Return the candidates where a rim of a cylinder is farthest below the plane of a cell, if that is in the cell."""
+    found, lies = [], abs(axes[2, 2]) < STANDS
+    reach = np.abs(axes.T) @ sizes
+    ranges = [_between(centre[f] - reach[f], centre[f] + reach[f], cell[f], field.shape[f]) for f in (0, 1)]
+    for i in range(ranges[0][2], ranges[0][3]):
+        for j in range(ranges[1][2], ranges[1][3]):
+            for end in (-1.0, 1.0) if lies else (-1.0 if axes[2, 2] > 0.0 else 1.0,):
+                corners = field[i : i + 2, j : j + 2]
+                place, steep = _on_rim(corners, cell, axes[2], sizes, end)
+                s, t = (centre + place)[:2] / cell - (i, j)
+                if steep or not (0.0 <= s <= 1.0 and 0.0 <= t <= 1.0):
+                    continue
+                depth = _in_cell(corners, cell, s, t, (centre + place)[2])[1]
+                u, v = (end * sizes[2], _across(axes[2]) @ place) if lies else (axes @ place)[:2]
+                found.append((depth, u, v, [RIMS, i, j, end, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    return found
+
+
+def _on_rim(corners, cell, axis, sizes, end):
+    """Return the place on a rim, from the middle, farthest against the plane of a cell, and whether that is steep."""
+    slope = np.array([corners[1] - corners[0], corners[:, 1] - corners[:, 0]]).mean(axis=1) / cell
+    n = np.array([*-slope, 1.0]) / np.sqrt(1.0 + slope @ slope)
+    out = n - (n @ axis) * axis
+    square = out @ out
+    out = out / np.sqrt(square) if square > UPRIGHT else np.zeros(3)
+    return end * sizes[2] * axis - sizes[0] * out, bool(slope @ slope > 1.0)
+
+
+def _in_cell(corners, cell, s, t, z):
+    """Return the normal of a cell's surface over a place in it, and the depth of a point at z there."""
+    height = np.array([1.0 - s, s]) @ corners @ np.array([1.0 - t, t])
+    slope_x = np.array([1.0 - t, t]) @ (corners[1] - corners[0]) / cell[0]
+    slope_y = np.array([1.0 - s, s]) @ (corners[:, 1] - corners[:, 0]) / cell[1]
+    n = np.array([-slope_x, -slope_y, 1.0]) / np.sqrt(1.0 + slope_x**2 + slope_y**2)
+    return n, (height - z) * n[2]
 
 
 def _capsule(field, cell, centre, axes, sizes, table):
@@ -179,8 +241,11 @@ def _capsule(field, cell, centre, axes, sizes, table):
     return _choose(_beside_axis(field, cell, centre, axes[2], radius, half))
 
 
-def _beside_axis(field, cell, centre, axis, radius, half, slack=None):
-    """Return the candidates beside an axis; ``slack``: of a cylinder, which has faces at the ends of its axis."""
+def _beside_axis(field, cell, centre, axis, radius, half, slack=None, across=None):
+    """Return the candidates beside an axis.
+
+    ``slack``, ``across``: of a cylinder, which has faces at the ends of its axis, and its horizontal direction across.
+    """
     found = []
     reach = np.abs(axis[:2]) * half + radius
     ranges = [_between(centre[f] - reach[f], centre[f] + reach[f], cell[f], field.shape[f]) for f in (0, 1)]
@@ -214,7 +279,14 @@ def _beside_axis(field, cell, centre, axis, radius, half, slack=None):
                 side = away[2] >= DOWN * distance and radius - distance <= half - abs(t) + slack
                 kind += SIDE
             if not outside or (away[2] > 0.0 if slack is None else side):
-                rows.append((-distance, t, 0.0, [kind, i, j, 1.0 if outside else -1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+                rows.append(
+                    (
+                        -distance if slack is None else radius - distance,
+                        t,
+                        0.0 if slack is None else -(across @ away),
+                        [kind, i, j, 1.0 if outside else -1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+                    )
+                )
     return rows
 
 
@@ -251,6 +323,11 @@ def touched(shape, field, cell, centre, axes, sizes, radius, row):
     if kind == NONE:
         return None
     corner = np.array([i * cell[0], j * cell[1], field[i, j]])
+    if kind == RIMS:
+        corners = field[i : i + 2, j : j + 2]
+        at = centre + _on_rim(corners, cell, axes[2], sizes, row[3])[0]
+        n, depth = _in_cell(corners, cell, *(at[:2] / cell - (i, j)), at[2])
+        return n, depth + radius, at - radius * n
     g = np.array([0.0, 0.0, 0.0])
     beside = shape == "capsule" or kind > SIDE
     size = sizes[0] if shape == "capsule" else sizes[0] + radius

@@ -88,10 +88,14 @@ class Scene(Stored):
         keyframes: named states.
         contacts: bodies that touch the ground or each other in :meth:`Dynamics.step`; other calls leave them out.
         ground: a :class:`Plane` or a :class:`HeightField`; None: the plane at height 0, where there are contacts.
+        initial_q: where a file places its bodies [coordinate]; None: ``neutral_q``.
 
     Attributes:
         bodies, hinges, loops, couplings, actuators, sites, keyframes, contacts, ground: the arguments;
             :meth:`with_values` changes only ``values``.
+        initial_q: the coordinates at which the file or model places its bodies [coordinate]: MuJoCo's qpos0, the
+            ``joint_q`` of the first world of a Newton model; ``neutral_q`` where the source says nothing. Free bodies
+            of ``neutral_q`` all lie at the origin.
         tree: the :class:`Tree` over the bodies.
         hinge_of: index of the hinge that carries each body [body].
         q_start: first entry of q of each hinge, and the total at the end [hinge + 1].
@@ -134,6 +138,7 @@ class Scene(Stored):
         keyframes: Mapping[str, Keyframe] = MappingProxyType({}),
         contacts: Sequence[Contact] = (),
         ground: Plane | HeightField | None = None,
+        initial_q: Any = None,
     ):
         self.bodies, self.hinges = _parts("bodies", bodies, Body), _parts("hinges", hinges, Hinge)
         self.loops, self.couplings = _parts("loops", loops, Loop), _parts("couplings", couplings, Coupling)
@@ -179,6 +184,8 @@ class Scene(Stored):
         self.dof_index = np.arange(self.dof_count)[None]
         self.sites = MappingProxyType({name: self._site(name, *site) for name, site in sites.items()})
         self.keyframes = MappingProxyType({name: self._keyframe(name, key) for name, key in keyframes.items()})
+        start = self.neutral_q if initial_q is None else initial_q
+        self.initial_q = read_only(checked_array("Scene", "initial_q", start, (self.coord_count,)))
         check_modes(self)
 
     def _site(self, name: str, body: int, pose: Any) -> tuple[int, tuple[float, ...]]:

@@ -34,7 +34,7 @@ class Appearance(NamedTuple):
 
 def scene_appearance(scene: Scene, q: np.ndarray | None = None) -> Appearance:
     """Return bones from joint to joint and the shapes that touch the ground, for a scene without a file."""
-    found = primitives(scene.without_loops(), scene.neutral_q if q is None else q)
+    found = primitives(scene.without_loops(), scene.initial_q if q is None else q)
     return Appearance(merged(map(primitive_surface, found)), [], [])
 
 

@@ -65,7 +65,7 @@ class RobotMotion:
     def __init__(self, scene: Scene):
         self.notes: list[str] = []
         self.scene, self.dyn = self._dynamics(scene)
-        self.q, self.qd = self.scene.neutral_q[None].copy(), np.zeros((1, self.scene.dof_count))
+        self.q, self.qd = self.scene.initial_q[None].copy(), np.zeros((1, self.scene.dof_count))
         self.time, self.status, self.held, self.dt = 0.0, Status.OK, True, 2e-3
         self.passes: int | None = None
         self._start_q = self.q.copy()

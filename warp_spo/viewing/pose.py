@@ -11,10 +11,10 @@ from .appearance import Appearance
 
 
 def first_pose(scene: Scene) -> np.ndarray:
-    """Return the coordinates of a scene's first keyframe; without one the neutral ones, within the joints' limits."""
+    """Return the coordinates of a scene's first keyframe; without one the initial ones, within the joints' limits."""
     for key in scene.keyframes.values():
         return np.array(key.q, np.float64)
-    q = scene.neutral_q.copy()
+    q = scene.initial_q.copy()
     low, high = (scene.values[f"joint_limit_{name}"][0] for name in ("lower", "upper"))
     for hinge in range(len(scene.hinges)):
         coords, dofs = (slice(int(s[hinge]), int(s[hinge + 1])) for s in (scene.q_start, scene.qd_start))

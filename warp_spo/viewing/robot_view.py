@@ -57,7 +57,7 @@ class RobotView:
             self.q = closed_pose(self._kinematics, self.q)
         self.poses = self._kinematics.body_poses(self.q[None])[0]
         low, high = extent(appearance, self.poses)
-        if floats(scene) and not scene.keyframes:
+        if floats(scene) and not scene.keyframes and np.array_equal(scene.initial_q, scene.neutral_q):
             self.q[2] -= low[2]  # stands on the ground
             self.poses = self._kinematics.body_poses(self.q[None])[0]
             low, high = extent(appearance, self.poses)
@@ -90,7 +90,7 @@ class RobotView:
         gui = self.page.gui
         tabs = gui.add_tab_group()
         with tabs.add_tab("Joints"):
-            keys = ["neutral", *self.scene.keyframes]
+            keys = ["initial", *self.scene.keyframes]
             self.keys = gui.add_dropdown("pose", keys, initial_value=keys[1] if len(keys) > 1 else keys[0])
             self._key = self.keys.value
             self.sliders = JointSliders(gui, self.scene, self.q)
@@ -218,7 +218,7 @@ class RobotView:
         if self.keys.value != self._key:
             self._key = self.keys.value
             named = self.scene.keyframes.get(self._key)
-            self.sliders.write(self.scene.neutral_q if named is None else named.q)
+            self.sliders.write(self.scene.initial_q if named is None else named.q)
             self.q[:] = self.sliders.q
         elif not self.sliders.read():
             return

@@ -75,7 +75,7 @@ def load(
     if name not in NAMES:
         raise ValueError(
             f"robots.load: {name!r} is unknown; expected one of {', '.join(NAMES)}; a file of yours is read by "
-            "spo.load(path, contacts=True), as python -m warp_spo.tasks --new TASK.py --robot ROBOT.xml writes"
+            "spo.load(path, contacts='ground'), as python -m warp_spo.tasks --new TASK.py --robot ROBOT.xml writes"
         )
     from ...mujoco.mjcf import compiled
 

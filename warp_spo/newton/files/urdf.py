@@ -25,6 +25,7 @@ from .inertia_repair import repair_bodies
 from .urdf_masses import mass_of_shapes
 from .urdf_mimics import SCALAR, read_mimics
 from .urdf_shapes import urdf_pairs, urdf_shapes
+from .urdf_unknown import warn_of_unknown
 from .xml_source import XmlElement, read_xml
 
 KINDS = {
@@ -77,6 +78,7 @@ def read_urdf(file: Path, floating: bool | None, repair: bool, selection: ShapeS
     couplings, held = read_mimics(carried)
     hinges = [base, *(_hinge(joint, number, label, held.get(index)) for index, joint in enumerate(carried))]
     _warn_of_limits(carried, held)
+    warn_of_unknown(file, [*carried, *links.values()])
     inertials = _inertials([links[link] for link in number], hinges, repair)
     masses, inertias = [i[0] for i in inertials], [i[2] for i in inertials]
     try:

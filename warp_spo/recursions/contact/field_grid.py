@@ -18,7 +18,8 @@ from .ground import GROUND, Corners, GroundOffset, Surface, clamp, upward_normal
 
 QUADRANTS, ROW = 4, 9  # rows of a search, and numbers of a row
 NONE, POINT, LINE_Y, FACE = 0.5, 1.5, 2.5, 3.5  # below which a row's kind is none, a point, a line along y, a face's
-SIDE = 3.0  # added to the kinds of what the side of a cylinder touches
+SIDE, BESIDE = 3.0, 6.5  # added to the kinds of what the side of a cylinder touches; above: a place on its rim
+UPRIGHT = 1e-8  # square of the sine below which a face is parallel to a cell, and no place on its rim is the lowest
 
 
 class Shape(NamedTuple):
@@ -69,10 +70,12 @@ def touch(
     kind, i, j, *found = row
     there = less(NONE, kind)
     beside: Value = float(shape.kind == CAPSULE_GRID)
+    on_rim: Value = 0.0
     if shape.kind == CYLINDER_GRID:
+        on_rim = less(BESIDE, kind)
         beside = less(FACE, kind)
         kind = kind - SIDE * beside
-    (size_x, size_y), along_y, is_point = ground.cells, less(kind, LINE_Y), less(kind, POINT)
+    (size_x, size_y), along_y, is_point = ground.cells, less(kind, LINE_Y), select(on_rim, 1.0, less(kind, POINT))
     cell = Corners.of(graph, ground, place, i, j)
     corner = Vector((i * size_x, j * size_y, cell.h00))
     size = size_y if size_x == size_y else select(along_y, size_y, size_x)
@@ -88,6 +91,12 @@ def touch(
             Vector(select(beside, a, b) for a, b in zip(ways[0][n], ways[1][n], strict=True)) for n in (0, 2)
         )
         depth = select(beside, depth, ways[1][1])
+        rim = _on_rim(ground, cell, shape, i, j, found[0])
+        normal, seat = (
+            Vector(select(on_rim, a, b) for a, b in zip(*pair, strict=True))
+            for pair in ((rim[0], normal), (rim[2], seat))
+        )
+        depth = select(on_rim, rim[1], depth)
     return GridPlace(Surface(normal, select(there, depth, AWAY), cell, near), seat)
 
 
@@ -132,6 +141,25 @@ def _beside_axis(
     normal = Vector(select(known, x * inverse, y) for x, y in zip(away, (0.0, 0.0, 1.0), strict=True))
     radius = shape.sizes[0] if shape.kind == CAPSULE_GRID else shape.sizes[0] + shape.radius
     return normal, radius - squares * inverse, axis * t - normal * radius
+
+
+def _on_rim(
+    ground: HeightField, cell: Corners, shape: Shape, i: Value, j: Value, end: Value
+) -> tuple[Vector, Value, Vector]:
+    """Return normal, depth and place where a rim of a cylinder is farthest below the plane of a cell."""
+    rate_x, rate_y = (1.0 / size for size in ground.cells)
+    axis = shape.axes[2]
+    up = upward_normal((cell.run + 0.5 * cell.twist) * rate_x, (cell.rise + 0.5 * cell.twist) * rate_y)
+    out = up - axis * dot(up, axis)
+    square = dot(out, out)
+    known = less(UPRIGHT, square)
+    far = select(known, shape.sizes[0] * inverse_root(select(known, square, 1.0)), 0.0)
+    seat = axis * (end * shape.sizes[2]) - out * far
+    at = shape.centre + seat
+    s, t = at[0] * rate_x - i, at[1] * rate_y - j
+    normal = upward_normal((cell.run + cell.twist * t) * rate_x, (cell.rise + cell.twist * s) * rate_y)
+    height = cell.base + cell.run * s + cell.rise * t + cell.twist * (s * t)
+    return normal, (height - at[2]) * normal[2] + shape.radius, seat - normal * shape.radius
 
 
 def _turned(axes: list[Vector], local: list[Scalar]) -> Vector:

@@ -1,0 +1,69 @@
+"""Elements and attributes of a URDF's joints and links that URDF does not define, such as misspelt ones.
+
+They are not read. What other programs write for shapes, and hints that concern no motion, are left alone.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from ...errors import quoted, shown
+from .xml_source import XmlElement
+
+JOINT = "name type origin parent child axis calibration dynamics limit mimic safety_controller dont_collapse"
+LINK = "name type inertial visual collision contact self_collision_checking collision_checking self_filter surface"
+KNOWN = {
+    "joint": JOINT,
+    "link": LINK,
+    "inertial": "origin mass inertia",
+    "origin": "xyz rpy quat_xyzw",
+    "mass": "value",
+    "inertia": "ixx ixy ixz iyy iyz izz",
+    "axis": "xyz",
+    "dynamics": "damping friction",
+    "limit": "lower upper effort velocity",
+    "mimic": "joint multiplier offset",
+    "parent": "link",
+    "child": "link",
+}
+"""Children and attributes by tag; elements of other tags are not looked into."""
+MOST, NAMES = 10, 3  # that the warning shows: things, and joints or links with each
+
+
+def warn_of_unknown(file: Path, holders: Iterable[XmlElement]) -> None:
+    """Warn once of what joints and links hold that URDF does not define; ``holders`` are their elements."""
+    found: dict[str, list[str]] = {}
+    for holder in holders:
+        for words in dict.fromkeys(_unknown(holder)):
+            found.setdefault(f"{words} of {holder.tag}s", []).append(str(holder.get("name")))
+    if found:
+        parts = [f"{words} {_listed(names)}" for words, names in list(found.items())[:MOST]]
+        more = f", and {len(found) - MOST} more" if len(found) > MOST else ""
+        warnings.warn(
+            f"load: {str(file)!r}: left out, because URDF does not define it: {', '.join(parts)}{more}; correct the "
+            "names, or pass the values that are meant to scene.with_values",
+            UserWarning,
+            stacklevel=4,
+        )
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - NAMES} more" if len(names) > NAMES else ""
+    return ", ".join(quoted(name) for name in names[:NAMES]) + more
+
+
+def _unknown(element: XmlElement) -> Iterator[str]:
+    """Yield what is unknown in an element and in its known children, such as ``'armature' of <dynamics>``."""
+    if element.tag not in KNOWN:
+        return
+    known = KNOWN[element.tag].split()
+    for name in element.keys():
+        if name not in known and not name.startswith("xmlns"):
+            yield f"'{shown(name)}' of <{element.tag}>" if element.tag not in ("joint", "link") else f"'{shown(name)}'"
+    for child in element:
+        if child.tag in known:
+            yield from _unknown(child)  # type: ignore[arg-type]
+        else:
+            yield f"<{shown(child.tag)}>"
