@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from . import convex_closed, convex_distance, convex_manifold, convex_shapes, native
+from . import convex_closed, convex_distance, convex_manifold, convex_passing, convex_shapes, native
 from .convex_shapes import BOX, CAPSULE, KINDS, PLANE, ROW, SIZES, SPHERE
 from .elementary import C_TYPE
 
@@ -25,6 +25,7 @@ STEPS = {wp.float32: 24, wp.float64: 40}  # towards the nearest points of two co
 TURNS = 8  # of the normal
 GAP = 0.01  # to which cores that overlap are shifted, in shares of both smallest sizes
 CLOSE = {wp.float32: 1e-5, wp.float64: 1e-10}  # share of a squared distance by which it may be too long
+FAINT = {wp.float32: 2e-3, wp.float64: 1e-6}  # share of the least half size that is nothing, beside rounding
 SETTLED = {wp.float32: 1e-3, wp.float64: 1e-7}  # share of the gap by which another turn has to be better
 NUMBERS = {
     "FLAT": 0.99905,  # cosine up to which a normal is that of a face: 2.5 degrees
@@ -32,6 +33,7 @@ NUMBERS = {
     "SAME": 1e-3,  # share of both smallest sizes within which two points are one
     "LACKS": 0.1,  # share of that by which a polygon's depth may be less than that of the shapes
     "GAP": GAP,
+    "SKIMS": 0.04,  # share of the least half size up to which shapes that touch may pass beside each other
     "NONE": 1e9,  # overlap of directions that are not there [m]
 }
 WHOLE = {
@@ -57,11 +59,24 @@ def routine(first: int, second: int) -> int:
 TABLE = {(KINDS[i], KINDS[j]): ROUTINES[routine(i, j)] for j in range(PLANE + 1) for i in range(min(j, PLANE - 1) + 1)}
 """The routine of each pair of kinds, the lower one first."""
 
+NEAREST = r"""
+    // Finds how two shapes are nearest, or overlap least; whether they are no farther apart than ``most``.
+    static CUDA_CALLABLE inline bool nearest(const Two& two, REAL most, Least& best)
+    {
+        IF_ROUND if (two.b.kind <= CAPSULE) return rounds(two, most, best); else
+        IF_BALL_ON_BOX if (two.a.kind == SPHERE && two.b.kind == BOX) return ball_on_box(two, most, best); else
+        IF_BOXES if (two.a.kind == BOX && two.b.kind == BOX) return boxes(two, most, best); else
+        IF_CONVEX if (true) return search(two, most, best); else
+        return false;
+    }
+"""
 COLLIDE = r"""
     // Puts the points of two shapes, each with its place [3] and rotation matrix [9]; returns how many there are.
-    // ``reach``: how far apart points may be that count.
+    // ``reach``: how far apart points may be that count. ``motion``: of both bodies, in the order of the shapes; shapes
+    // that pass beside each other then have no points.
     static CUDA_CALLABLE inline int collide(const Shape& one, const Shape& other, const Tables& tables, const REAL* at,
-        const REAL* turn_of, const REAL* other_at, const REAL* other_turn_of, REAL reach, REAL* to)
+        const REAL* turn_of, const REAL* other_at, const REAL* other_turn_of, REAL reach, REAL* to,
+        const Motion* motion = nullptr)
     {
         // the lower kind comes first
         const bool swap = one.kind > other.kind;
@@ -93,34 +108,30 @@ COLLIDE = r"""
         }
         const REAL most = two.a.radius + two.b.radius + reach;
         Least best;
-        bool near = false;
-        IF_ROUND if (two.b.kind <= CAPSULE) return put_rounds(two, most, sink); else
-        IF_BALL_ON_BOX if (two.a.kind == SPHERE && two.b.kind == BOX) return put_ball(two, most, sink); else
-        IF_BOXES if (two.a.kind == BOX && two.b.kind == BOX) near = boxes(two, most, best); else
-        IF_CONVEX near = search(two, most, best);
-        ;
-        IF_FACES if (near) manifold(two, best, sink);
-        return sink.count;
+        if (!nearest(two, most, best)) return 0;
+        IF_ROUND if (two.b.kind <= CAPSULE) put_rounds(two, best, sink); else
+        IF_BALL_ON_BOX if (two.a.kind == SPHERE && two.b.kind == BOX) put_deepest(two, best, sink); else
+        IF_FACES if (true) manifold(two, best, sink); else
+        return 0;
+        if (!motion || best.overlap + two.a.radius + two.b.radius > 0) return sink.count;
+        REAL u[3], drift[3];
+        const REAL one_least = two.a.least(), other_least = two.b.least();
+        const REAL faint = (REAL)FAINT * (one_least < other_least ? one_least : other_least);
+        if (!(approach(*motion, to, sink.count, u) > faint)) return sink.count;
+        UNROLL
+        for (int r = 0; r < 3; ++r) u[r] = swap ? u[r] : -u[r];
+        turned_back(turn, u, drift);
+        return passes_by(two, best, drift, most, motion->h) ? 0 : sink.count;
     }
 
-    static CUDA_CALLABLE inline int put_rounds(const Two& two, REAL most, Sink& sink)
+    static CUDA_CALLABLE inline void put_rounds(const Two& two, const Least& best, Sink& sink)
     {
-        Least best;
-        if (!rounds(two, most, best)) return 0;
         put_deepest(two, best, sink);
-        if (two.a.kind == SPHERE) return sink.count;
+        if (two.a.kind == SPHERE) return;
         const REAL along[3] = {0, 0, 1};
         Feature f = facing(two.a, two.tables, along), g = facing(two.b, two.tables, along);
         g.move(two.turn, two.at);
         put_ends(two, best, f, g, sink);
-        return sink.count;
-    }
-
-    static CUDA_CALLABLE inline int put_ball(const Two& two, REAL most, Sink& sink)
-    {
-        Least best;
-        if (ball_on_box(two, most, best)) put_deepest(two, best, sink);
-        return sink.count;
     }
 
     static CUDA_CALLABLE inline void rotation(const REAL* q, REAL* R)
@@ -165,7 +176,16 @@ counts.data[place] = convex::collide(shape[0], shape[1], tables, at[0], turn[0],
 def definition(T: type, routines: Any = ROUTINES) -> str:
     """Return the definition of ``convex`` for scalars of type ``T``, with those of ROUTINES that are named."""
     texts = (convex_shapes, convex_distance, convex_manifold, convex_closed)
-    return _for_scalars("struct convex\n{" + "".join(text.NATIVE for text in texts) + COLLIDE + "};\n", T, routines)
+    return _for_scalars(
+        "struct convex\n{"
+        + "".join(text.NATIVE for text in texts)
+        + NEAREST
+        + convex_passing.NATIVE
+        + COLLIDE
+        + "};\n",
+        T,
+        routines,
+    )
 
 
 def _for_scalars(text: str, T: type, routines: Any) -> str:
@@ -175,7 +195,8 @@ def _for_scalars(text: str, T: type, routines: Any) -> str:
         text = text.replace(mark, "") if name in there else re.sub(rf"\n *{mark}.*", "", text)
     number = "f" if T is wp.float32 else ""
     words = {name: f"{value!r}{number}" for name, value in NUMBERS.items()} | {
-        "CLOSE": f"{CLOSE[T]!r}{number}", "SETTLED": f"{SETTLED[T]!r}{number}", "STEPS": str(STEPS[T]),
+        "CLOSE": f"{CLOSE[T]!r}{number}", "SETTLED": f"{SETTLED[T]!r}{number}", "FAINT": f"{FAINT[T]!r}{number}",
+        "STEPS": str(STEPS[T]),
         "REAL": C_TYPE[T], "UNROLL": "#pragma unroll", "LOOP": "#pragma unroll 1",
     }  # fmt: skip
     words |= {name: str(value) for name, value in WHOLE.items()}

@@ -20,9 +20,9 @@ from .elementary import C_TYPE
 from .joint_space import MOST, POINT
 
 LANES = 32
-SIDE = ("x", "y", "z", "qx", "qy", "qz", "qw", "size_x", "size_y", "size_z", "arm", "ball")
-"""Constants of a shape of a pair: its pose in the body, half the sizes of the box around it, how far it reaches from
-the body's CoM, and the radius of the ball around it [m]."""
+SIDE = ("x", "y", "z", "qx", "qy", "qz", "qw", "size_x", "size_y", "size_z", "com_x", "com_y", "com_z", "arm", "ball")
+"""Constants of a shape of a pair: its pose in the body, half the sizes of the box around it, the body's CoM, how far it
+reaches from that, and the radius of the ball around it [m]."""
 WHICH = ("body", "shape")
 """Integers of a shape of a pair; body -1 is the inertial frame."""
 
@@ -203,14 +203,25 @@ for (int side = 0; side < 2; ++side) {
     convex::rotation(q, turn[side]);
 }
 const REAL* const rates = velocities.data + world * velocities.shape[1] * 6;
+convex::Motion motion;
+motion.h = h;
+for (int side = 0; side < 2; ++side) {
+    const int body = place.data[(2 * pair + side) * WHICH];
+    motion.rates[side] = body < 0 ? nullptr : rates + 6 * body;
+    if (body < 0) continue;
+    turned::by(own + 7 * body + 3, sides.data + (2 * pair + side) * SIDE + COM, motion.com[side]);
+    for (int c = 0; c < 3; ++c) motion.com[side][c] += own[7 * body + c];
+}
 list[1 + NEAR + k] = convex::collide(shape[0], shape[1], tables, at[0], turn[0], at[1], turn[1],
-    turned::reach(rates, place.data, sides.data, pair, slack, h), touches.data + (world * NEAR + k) * (MOST * POINT));
+    turned::reach(rates, place.data, sides.data, pair, slack, h), touches.data + (world * NEAR + k) * (MOST * POINT),
+    &motion);
 """
 
 
 def _text(body: str, pairs: int, near: int, T: type) -> str:
     sizes = {
         "PAIRS": pairs, "NEAR": near, "SIDE": len(SIDE), "ARM": SIDE.index("arm"), "BOX": SIDE.index("size_x"),
+        "COM": SIDE.index("com_x"),
         "WHICH": len(WHICH), "MOST": MOST,
         "POINT": POINT, "ROW": convex_pairs.ROW, "SIZES": convex_pairs.SIZES,
     }  # fmt: skip

@@ -180,7 +180,7 @@ class JointSpaceStep:
                     sizes, ball = np.abs(corners).max(axis=0), float(np.linalg.norm(corners, axis=1).max())
                 com = scene.values["body_com"][0, body] if body >= 0 else at
                 which.append([body, row])
-                sides.append([*at, *shape.pose[3:], *sizes, float(np.linalg.norm(at - com)) + ball, ball])
+                sides.append([*at, *shape.pose[3:], *sizes, *com, float(np.linalg.norm(at - com)) + ball, ball])
         assert not sides or len(sides[0]) == len(near_pairs.SIDE)
         self.which, self.sides = array(np.ravel(which), dtype=int), array(np.ravel(sides))
         routines = rows.routines([which[i][1::2] + which[i + 1][1::2] for i in range(0, len(which), 2)])
