@@ -59,32 +59,17 @@ def routine(first: int, second: int) -> int:
 TABLE = {(KINDS[i], KINDS[j]): ROUTINES[routine(i, j)] for j in range(PLANE + 1) for i in range(min(j, PLANE - 1) + 1)}
 """The routine of each pair of kinds, the lower one first."""
 
-NEAREST = r"""
-    // Finds how two shapes are nearest, or overlap least; whether they are no farther apart than ``most``.
-    static CUDA_CALLABLE inline bool nearest(const Two& two, REAL most, Least& best)
-    {
-        IF_ROUND if (two.b.kind <= CAPSULE) return rounds(two, most, best); else
-        IF_BALL_ON_BOX if (two.a.kind == SPHERE && two.b.kind == BOX) return ball_on_box(two, most, best); else
-        IF_BOXES if (two.a.kind == BOX && two.b.kind == BOX) return boxes(two, most, best); else
-        IF_CONVEX if (true) return search(two, most, best); else
-        return false;
-    }
-"""
 COLLIDE = r"""
-    // Puts the points of two shapes, each with its place [3] and rotation matrix [9]; returns how many there are.
-    // ``reach``: how far apart points may be that count. ``motion``: of both bodies, in the order of the shapes; shapes
-    // that pass beside each other then have no points.
-    static CUDA_CALLABLE inline int collide(const Shape& one, const Shape& other, const Tables& tables, const REAL* at,
-        const REAL* turn_of, const REAL* other_at, const REAL* other_turn_of, REAL reach, REAL* to,
-        const Motion* motion = nullptr)
+    // Fills in two shapes, the place and the rotation of the first of them; returns whether they changed places.
+    static CUDA_CALLABLE inline bool lay(const Shape& one, const Shape& other, const Tables& tables, const REAL* at,
+        const REAL* turn_of, const REAL* other_at, const REAL* other_turn_of, Two& two, REAL* here, REAL* turn)
     {
         // the lower kind comes first
         const bool swap = one.kind > other.kind;
-        Two two;
         two.a = swap ? other : one;
         two.b = swap ? one : other;
         two.tables = tables;
-        REAL turn[9], other_turn[9], here[3], apart[3];
+        REAL other_turn[9], apart[3];
         UNROLL
         for (int i = 0; i < 9; ++i) {
             turn[i] = swap ? other_turn_of[i] : turn_of[i];
@@ -101,6 +86,17 @@ COLLIDE = r"""
             UNROLL
             for (int j = 0; j < 3; ++j) two.turn[3 * i + j] = turn[i] * other_turn[j] + turn[3 + i] * other_turn[3 + j]
                 + turn[6 + i] * other_turn[6 + j];
+        return swap;
+    }
+
+    // Puts the points of two shapes, each with its place [3] and rotation matrix [9]; returns how many there are.
+    // ``reach``: how far apart points may be that count.
+    static CUDA_CALLABLE inline int collide(const Shape& one, const Shape& other, const Tables& tables, const REAL* at,
+        const REAL* turn_of, const REAL* other_at, const REAL* other_turn_of, REAL reach, REAL* to)
+    {
+        Two two;
+        REAL turn[9], here[3];
+        const bool swap = lay(one, other, tables, at, turn_of, other_at, other_turn_of, two, here, turn);
         Sink sink = {to, 0, here, turn, reach, swap ? (REAL)-1 : (REAL)1};
         if (two.b.kind == PLANE) {
             IF_ON_PLANE on_plane(two, 1, sink);
@@ -108,30 +104,34 @@ COLLIDE = r"""
         }
         const REAL most = two.a.radius + two.b.radius + reach;
         Least best;
-        if (!nearest(two, most, best)) return 0;
-        IF_ROUND if (two.b.kind <= CAPSULE) put_rounds(two, best, sink); else
-        IF_BALL_ON_BOX if (two.a.kind == SPHERE && two.b.kind == BOX) put_deepest(two, best, sink); else
-        IF_FACES if (true) manifold(two, best, sink); else
-        return 0;
-        if (!motion || best.overlap + two.a.radius + two.b.radius > 0) return sink.count;
-        REAL u[3], drift[3];
-        const REAL one_least = two.a.least(), other_least = two.b.least();
-        const REAL faint = (REAL)FAINT * (one_least < other_least ? one_least : other_least);
-        if (!(approach(*motion, to, sink.count, u) > faint)) return sink.count;
-        UNROLL
-        for (int r = 0; r < 3; ++r) u[r] = swap ? u[r] : -u[r];
-        turned_back(turn, u, drift);
-        return passes_by(two, best, drift, most, motion->h) ? 0 : sink.count;
+        bool near = false;
+        IF_ROUND if (two.b.kind <= CAPSULE) return put_rounds(two, most, sink); else
+        IF_BALL_ON_BOX if (two.a.kind == SPHERE && two.b.kind == BOX) return put_ball(two, most, sink); else
+        IF_BOXES if (two.a.kind == BOX && two.b.kind == BOX) near = boxes(two, most, best); else
+        IF_CONVEX near = search(two, most, best);
+        ;
+        IF_FACES if (near) manifold(two, best, sink);
+        return sink.count;
     }
 
-    static CUDA_CALLABLE inline void put_rounds(const Two& two, const Least& best, Sink& sink)
+    static CUDA_CALLABLE inline int put_rounds(const Two& two, REAL most, Sink& sink)
     {
+        Least best;
+        if (!rounds(two, most, best)) return 0;
         put_deepest(two, best, sink);
-        if (two.a.kind == SPHERE) return;
+        if (two.a.kind == SPHERE) return sink.count;
         const REAL along[3] = {0, 0, 1};
         Feature f = facing(two.a, two.tables, along), g = facing(two.b, two.tables, along);
         g.move(two.turn, two.at);
         put_ends(two, best, f, g, sink);
+        return sink.count;
+    }
+
+    static CUDA_CALLABLE inline int put_ball(const Two& two, REAL most, Sink& sink)
+    {
+        Least best;
+        if (ball_on_box(two, most, best)) put_deepest(two, best, sink);
+        return sink.count;
     }
 
     static CUDA_CALLABLE inline void rotation(const REAL* q, REAL* R)
@@ -173,19 +173,14 @@ counts.data[place] = convex::collide(shape[0], shape[1], tables, at[0], turn[0],
 """
 
 
-def definition(T: type, routines: Any = ROUTINES) -> str:
-    """Return the definition of ``convex`` for scalars of type ``T``, with those of ROUTINES that are named."""
+def definition(T: type, routines: Any = ROUTINES, passing: bool = False) -> str:
+    """Return the definition of ``convex`` for scalars of type ``T``, with those of ROUTINES that are named.
+
+    ``passing``: with what tells whether shapes pass beside each other.
+    """
     texts = (convex_shapes, convex_distance, convex_manifold, convex_closed)
-    return _for_scalars(
-        "struct convex\n{"
-        + "".join(text.NATIVE for text in texts)
-        + NEAREST
-        + convex_passing.NATIVE
-        + COLLIDE
-        + "};\n",
-        T,
-        routines,
-    )
+    more = COLLIDE + (convex_passing.NATIVE if passing else "")
+    return _for_scalars("struct convex\n{" + "".join(text.NATIVE for text in texts) + more + "};\n", T, routines)
 
 
 def _for_scalars(text: str, T: type, routines: Any) -> str:
@@ -195,8 +190,8 @@ def _for_scalars(text: str, T: type, routines: Any) -> str:
         text = text.replace(mark, "") if name in there else re.sub(rf"\n *{mark}.*", "", text)
     number = "f" if T is wp.float32 else ""
     words = {name: f"{value!r}{number}" for name, value in NUMBERS.items()} | {
-        "CLOSE": f"{CLOSE[T]!r}{number}", "SETTLED": f"{SETTLED[T]!r}{number}", "FAINT": f"{FAINT[T]!r}{number}",
-        "STEPS": str(STEPS[T]),
+        "CLOSE": f"{CLOSE[T]!r}{number}", "SETTLED": f"{SETTLED[T]!r}{number}",
+        "FAINT": f"{FAINT[T]!r}{number}", "STEPS": str(STEPS[T]),
         "REAL": C_TYPE[T], "UNROLL": "#pragma unroll", "LOOP": "#pragma unroll 1",
     }  # fmt: skip
     words |= {name: str(value) for name, value in WHOLE.items()}

@@ -8,6 +8,16 @@ is then less than half as deep as the speed along the normal says, it passes by.
 """
 
 NATIVE = r"""
+    // Finds how two shapes are nearest, or overlap least; whether they are no farther apart than ``most``.
+    static CUDA_CALLABLE inline bool nearest(const Two& two, REAL most, Least& best)
+    {
+        IF_ROUND if (two.b.kind <= CAPSULE) return rounds(two, most, best); else
+        IF_BALL_ON_BOX if (two.a.kind == SPHERE && two.b.kind == BOX) return ball_on_box(two, most, best); else
+        IF_BOXES if (two.a.kind == BOX && two.b.kind == BOX) return boxes(two, most, best); else
+        IF_CONVEX if (true) return search(two, most, best); else
+        return false;
+    }
+
     // How two bodies move: linear velocity of the CoM and angular velocity of each, nullptr at rest, and the CoM.
     struct Motion
     {
@@ -32,34 +42,53 @@ NATIVE = r"""
         }
     };
 
-    // Finds the point that comes nearest in the step, and the relative velocity there; returns how deep it comes.
-    static CUDA_CALLABLE inline REAL approach(const Motion& motion, const REAL* points, int count, REAL* drift)
+    // Finds the point that comes nearest in the step, and the relative velocity there; returns whether all are apart
+    // and it meets.
+    static CUDA_CALLABLE inline bool approach(const Motion& motion, const REAL* points, int count, REAL faint,
+        REAL* drift)
     {
         REAL most = -NONE;
+        bool apart = true;
         LOOP
         for (int i = 0; i < count; ++i) {
             const REAL* point = points + ENTRY * i;
             REAL u[3];
             motion.at(point, u);
             const REAL deep = point[6] - motion.h * dot(point + 3, u);
+            apart = apart && !(point[6] > 0);
             if (!(deep > most)) continue;
             most = deep;
             UNROLL
             for (int r = 0; r < 3; ++r) drift[r] = u[r];
         }
-        return most;
+        return apart && most > faint;
     }
 
-    // Whether the second shape, which moves by ``drift`` against the first one, passes by within ``h``.
-    static CUDA_CALLABLE inline bool passes_by(Two two, Least best, const REAL* drift, REAL most, REAL h)
+    static CUDA_CALLABLE inline REAL least_of(const Shape& one, const Shape& other)
     {
-        const REAL one = two.a.least(), other = two.b.least(), least = one < other ? one : other;
-        REAL time = 0, expected = 0;
+        const REAL x = one.least(), y = other.least();
+        return x < y ? x : y;
+    }
+
+    // Whether the first shape, which moves by ``u`` against the other one, passes by within ``h``; ``reach`` as above.
+    static CUDA_CALLABLE inline bool passes_by(const Shape& one, const Shape& other, const Tables& tables,
+        const REAL* at, const REAL* turn_of, const REAL* other_at, const REAL* other_turn_of, REAL reach, const REAL* u, REAL h)
+    {
+        Two two;
+        REAL turn[9], here[3], ahead[3], drift[3], time = 0, expected = 0;
+        const bool swap = lay(one, other, tables, at, turn_of, other_at, other_turn_of, two, here, turn);
+        UNROLL
+        for (int r = 0; r < 3; ++r) ahead[r] = swap ? u[r] : -u[r];
+        turned_back(turn, ahead, drift);
+        const REAL least = least_of(one, other), most = two.a.radius + two.b.radius + reach;
         bool touched = false;
         LOOP
         for (int round = 0; round < 12; ++round) {
+            Least best;
+            if (!nearest(two, most, best)) return round > 0;
             const REAL gap = -(best.overlap + two.a.radius + two.b.radius), closing = dot(best.normal, drift);
             if (touched) return -gap < (REAL)0.5 * expected;
+            if (round == 0 && !(gap > 0)) return false;
             if (!(closing > 0)) return true;
             REAL step = gap / closing;
             if (gap > (REAL)FAINT * least) {
@@ -74,7 +103,6 @@ NATIVE = r"""
             time += step;
             UNROLL
             for (int r = 0; r < 3; ++r) two.at[r] += step * drift[r];
-            if (!nearest(two, most, best)) return true;
         }
         return false;
     }

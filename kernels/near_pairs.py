@@ -3,7 +3,9 @@
 A warp a world looks at the balls around the shapes of all pairs, and at the box around each and the ball around the
 other, and lists those that are near, in the order of the scene. Where more are near than the list takes, those stay
 whose balls and boxes overlap most now, whatever their speeds, and of those that overlap equally the first ones. A
-thread a near pair then finds its points by :mod:`.convex_pairs`. The lists do not depend on the order of threads.
+thread a near pair then finds its points by :mod:`.convex_pairs`, and in another kernel, whose registers the first one
+does not wait for, takes them away where the two pass beside each other (:mod:`.convex_passing`). The lists do not
+depend on the order of threads.
 
 Two shapes are near where they are no farther apart than ``slack``, and what both can move in a step, twice: a body
 that another one strikes leaves it at most twice as fast as it was struck.
@@ -171,25 +173,29 @@ for (int round = 0; round < rounds; ++round) {
 }
 #undef LANES
 """
-NARROW = r"""
+PAIR = r"""
 const long long world = thread % worlds;
 const int k = (int)(thread / worlds);
 int* const list = near.data + world * (1 + 2 * NEAR);
 if (k >= NEAR || k >= list[0]) return;
 const int pair = list[1 + k];
-list[1 + NEAR + k] = 0;
-if (pair < 0) return;
+FIRST
 const REAL* const own = poses.data + world * poses.shape[1] * 7;
+const REAL* const rates = velocities.data + world * velocities.shape[1] * 6;
 const convex::Tables tables = {corners.data, planes.data, face_starts.data, face_corners.data};
 convex::Shape shape[2];
 REAL at[2][3], turn[2][9];
 for (int side = 0; side < 2; ++side) {
     const int* const which = place.data + (2 * pair + side) * WHICH;
-    const REAL* const value = sides.data + (2 * pair + side) * SIDE;
-    const REAL* const pose = which[0] < 0 ? nullptr : own + 7 * which[0];
     const int* const row = shape_rows.data + ROW * which[1];
     const REAL* const size = sizes.data + SIZES * which[1];
     shape[side] = {row[0], row[1], row[2], row[3], row[4], {size[0], size[1], size[2]}, size[3]};
+}
+BETWEEN
+for (int side = 0; side < 2; ++side) {
+    const int* const which = place.data + (2 * pair + side) * WHICH;
+    const REAL* const value = sides.data + (2 * pair + side) * SIDE;
+    const REAL* const pose = which[0] < 0 ? nullptr : own + 7 * which[0];
     turned::middle(pose, value, at[side]);
     const REAL* const b = value + 3;
     REAL q[4] = {b[0], b[1], b[2], b[3]};
@@ -202,7 +208,25 @@ for (int side = 0; side < 2; ++side) {
     }
     convex::rotation(q, turn[side]);
 }
-const REAL* const rates = velocities.data + world * velocities.shape[1] * 6;
+const REAL reach = turned::reach(rates, place.data, sides.data, pair, slack, h);
+LAST
+"""
+NARROW = {
+    "FIRST": r"""
+list[1 + NEAR + k] = 0;
+if (pair < 0) return;
+""",
+    "BETWEEN": "",
+    "LAST": r"""
+list[1 + NEAR + k] = convex::collide(shape[0], shape[1], tables, at[0], turn[0], at[1], turn[1], reach,
+    touches.data + (world * NEAR + k) * (MOST * POINT));
+""",
+}
+PASSING = {
+    "FIRST": r"""
+if (pair < 0 || list[1 + NEAR + k] == 0) return;
+""",
+    "BETWEEN": r"""
 convex::Motion motion;
 motion.h = h;
 for (int side = 0; side < 2; ++side) {
@@ -212,10 +236,15 @@ for (int side = 0; side < 2; ++side) {
     turned::by(own + 7 * body + 3, sides.data + (2 * pair + side) * SIDE + COM, motion.com[side]);
     for (int c = 0; c < 3; ++c) motion.com[side][c] += own[7 * body + c];
 }
-list[1 + NEAR + k] = convex::collide(shape[0], shape[1], tables, at[0], turn[0], at[1], turn[1],
-    turned::reach(rates, place.data, sides.data, pair, slack, h), touches.data + (world * NEAR + k) * (MOST * POINT),
-    &motion);
-"""
+REAL u[3];
+const REAL faint = (REAL)FAINT * convex::least_of(shape[0], shape[1]);
+if (!convex::approach(motion, touches.data + (world * NEAR + k) * (MOST * POINT), list[1 + NEAR + k], faint, u)) return;
+""",
+    "LAST": r"""
+if (convex::passes_by(shape[0], shape[1], tables, at[0], turn[0], at[1], turn[1], reach, u, h)) list[1 + NEAR + k] = 0;
+""",
+}
+"""Text of the narrow phase, and of the kernel that follows it: what they do first, between, and last in PAIR."""
 
 
 def _text(body: str, pairs: int, near: int, T: type) -> str:
@@ -238,16 +267,33 @@ def broad(pairs: int, near: int, T: type) -> wp.Kernel:
     return native.kernel("broad_phase", _text(BROAD, pairs, near, T), arrays, T)
 
 
+ARRAYS = [
+    ("poses", 3), ("velocities", 3), ("place", 1), ("sides", 1), ("slack", 0), ("h", 0), ("shape_rows", 1),
+    ("sizes", 2), ("corners", 1), ("planes", 1), ("face_starts", 1), ("face_corners", 1), ("near", 1),
+    ("touches", 2),
+]  # fmt: skip
+"""Of both kernels."""
+
+
 @functools.cache
 def narrow(pairs: int, near: int, T: type, routines: tuple[str, ...]) -> wp.Kernel:
     """Find the points of the pairs that are listed; ``near`` threads a world, worlds side by side.
 
     ``routines``: of :data:`.convex_pairs.ROUTINES` those that the pairs need. Shapes are as there.
     """
-    arrays = [
-        ("poses", 3), ("velocities", 3), ("place", 1), ("sides", 1), ("slack", 0), ("h", 0), ("shape_rows", 1),
-        ("sizes", 2), ("corners", 1), ("planes", 1), ("face_starts", 1), ("face_corners", 1), ("near", 1),
-        ("touches", 2),
-    ]  # fmt: skip
-    text = convex_pairs.definition(T, routines) + _text(NARROW, pairs, near, T)
-    return native.kernel("narrow_phase", text, arrays, T)
+    text = convex_pairs.definition(T, routines) + _pair_text(NARROW, pairs, near, T)
+    return native.kernel("narrow_phase", text, ARRAYS, T)
+
+
+@functools.cache
+def passing(pairs: int, near: int, T: type, routines: tuple[str, ...]) -> wp.Kernel:
+    """Take away the points of pairs that pass beside each other in the step; arguments and threads of :func:`narrow`."""
+    text = convex_pairs.definition(T, routines, passing=True) + _pair_text(PASSING, pairs, near, T)
+    return native.kernel("passing_pairs", text, ARRAYS, T)
+
+
+def _pair_text(parts: dict[str, str], pairs: int, near: int, T: type) -> str:
+    text = PAIR
+    for name, part in parts.items():
+        text = text.replace(f"\n{name}\n", f"\n{part.strip()}\n" if part else "\n")
+    return _text(text, pairs, near, T).replace("FAINT", repr(convex_pairs.FAINT[T]))

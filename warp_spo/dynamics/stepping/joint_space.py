@@ -187,7 +187,8 @@ class JointSpaceStep:
         kinds = [array(np.ravel(rows.rows), dtype=int), array(rows.sizes)]
         kinds += [array(np.ravel(each)) for each in (rows.corners, rows.planes)]
         self.shapes = kinds + [array(each, dtype=int) for each in (rows.starts, rows.loops)]
-        self.narrow = near_pairs.narrow(self.tables.sizes.pairs, self.near_count, T, routines)
+        kernels = near_pairs.narrow, near_pairs.passing
+        self.narrow, self.passing = (each(self.tables.sizes.pairs, self.near_count, T, routines) for each in kernels)
 
     def _launch(self, kernel: Any, threads: int, inputs: list, outputs: list, block: int = 64) -> None:
         launches.launch(kernel, threads, [self.worlds, *inputs], outputs, device=self.device, block_dim=block)
@@ -199,7 +200,8 @@ class JointSpaceStep:
         shapes = [self.poses, self.velocities, self.which, self.sides, slack, dt]
         self._launch(self.broad, a_world * self.worlds, shapes, [self.near], 128)
         threads = self.near_count * self.worlds
-        self._launch(self.narrow, threads, [*shapes, *self.shapes, self.near], [self.touches])
+        for kernel in (self.narrow, self.passing):
+            self._launch(kernel, threads, [*shapes, *self.shapes, self.near], [self.touches])
 
     def solve(
         self,
