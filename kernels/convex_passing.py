@@ -43,12 +43,17 @@ NATIVE = r"""
     };
 
     // Finds the point that comes nearest in the step, and the relative velocity there; returns whether all are apart
-    // and it meets.
+    // and it meets. Not of bodies that turn by more than TURNED: they are moved without turning.
     static CUDA_CALLABLE inline bool approach(const Motion& motion, const REAL* points, int count, REAL faint,
         REAL* drift)
     {
         REAL most = -NONE;
         bool apart = true;
+        UNROLL
+        for (int side = 0; side < 2; ++side) {
+            const REAL* const w = motion.rates[side] ? motion.rates[side] + 3 : nullptr;
+            apart = apart && !(w && motion.h * motion.h * dot(w, w) > (REAL)TURNED * (REAL)TURNED);
+        }
         LOOP
         for (int i = 0; i < count; ++i) {
             const REAL* point = points + ENTRY * i;
@@ -70,9 +75,10 @@ NATIVE = r"""
         return x < y ? x : y;
     }
 
-    // Whether the first shape, which moves by ``u`` against the other one, passes by within ``h``; ``reach`` as above.
+    // Whether the first shape, which moves by ``u`` against the other one, passes by within ``h``.
     static CUDA_CALLABLE inline bool passes_by(const Shape& one, const Shape& other, const Tables& tables,
-        const REAL* at, const REAL* turn_of, const REAL* other_at, const REAL* other_turn_of, REAL reach, const REAL* u, REAL h)
+        const REAL* at, const REAL* turn_of, const REAL* other_at, const REAL* other_turn_of, REAL reach,
+        const REAL* u, REAL h)
     {
         Two two;
         REAL turn[9], here[3], ahead[3], drift[3], time = 0, expected = 0;

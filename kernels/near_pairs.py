@@ -287,7 +287,7 @@ def narrow(pairs: int, near: int, T: type, routines: tuple[str, ...]) -> wp.Kern
 
 @functools.cache
 def passing(pairs: int, near: int, T: type, routines: tuple[str, ...]) -> wp.Kernel:
-    """Take away the points of pairs that pass beside each other in the step; arguments and threads of :func:`narrow`."""
+    """Take away the points of pairs that pass beside each other; arguments and threads of :func:`narrow`."""
     text = convex_pairs.definition(T, routines, passing=True) + _pair_text(PASSING, pairs, near, T)
     return native.kernel("passing_pairs", text, ARRAYS, T)
 
