@@ -56,6 +56,8 @@ for (int number = 0;; ++number) {
         }
         const bool closed = (candidate && (first || push > 0)) || (last && shut);
         across = mu * fn / sqrt(FMA(w, w, value[P_EPS] * value[P_EPS]));
+        const REAL rigid = (REAL)RIGID / (h * value[P_WEIGHT]);
+        across = across > rigid ? rigid : across;
         slot[ACROSS * S + at] = across;
         slot[FLAG * S + at] = closed + 2 * candidate;
         slot[CN * S + at] = closed ? h * kd : 0;
@@ -170,6 +172,8 @@ for (int number = 0;; ++number) {
     EACH (i, N) {
         if (table[T_DOF_OF + i] < 0) A[joint_space::tile(i >> 1, i >> 1)].x[3 * (i & 1)] = 1;
         A[joint_space::tile(NB, i >> 1)].x[i & 1] = dof[R * N + i];
+        const int own = table[T_DOF_OF + i];  // a pivot is an inertia at least, if nothing is rounded
+        dof[CHANGE * N + i] = own < 0 ? 0 : (REAL)FLOOR / dof_value[DV * own + C_WEIGHT];
     }
     SYNC
     // -- A: the points, a couple after the other; open ones are left out
@@ -211,13 +215,16 @@ for (int number = 0;; ++number) {
         SYNC
     }
     // -- Cholesky, a column of tiles after the other; the right side is the last row
+    floored = false;
     LOOP
     for (int j = 0; j < NB; ++j) {
         const int below = count[j];
         const unsigned char* const list = rows + j * (NB + 1);
         const Tile diagonal = A[joint_space::tile(j, j)];
-        const REAL i0 = joint_space::inverse_root(diagonal.x[0]), l10 = diagonal.x[2] * i0;
-        const REAL i1 = joint_space::inverse_root(FMA(-l10, l10, diagonal.x[3]));
+        const REAL d0 = diagonal.x[0], least0 = dof[CHANGE * N + 2 * j], least1 = dof[CHANGE * N + 2 * j + 1];
+        const REAL i0 = joint_space::inverse_root(d0 < least0 ? least0 : d0), l10 = diagonal.x[2] * i0;
+        const REAL d1 = FMA(-l10, l10, diagonal.x[3]), i1 = joint_space::inverse_root(d1 < least1 ? least1 : d1);
+        floored |= d0 < least0 || d1 < least1;
         if (lane == 0) {
             dof[I0 * N + j] = i0;
             dof[L10 * N + j] = l10;
@@ -343,7 +350,7 @@ for (int number = 0;; ++number) {
 // -- results
 SYNC
 REAL *const excesses = s + AT_A;
-int wrong = 0;  // 1: a result is no number, 2: an input is none
+int wrong = floored;  // 1: a result is no number, or rounding is more than a pivot; 2: an input is none
 LOOP
 EACH (i, N) {
     const int own = table[T_DOF_OF + i];

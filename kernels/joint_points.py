@@ -290,4 +290,5 @@ EACH (at, slots) {
     slot[FLAG * S + at] = slot[ACROSS * S + at] = 0;
 }
 REAL cone = 0, pull = 0, effort_excess = 0, missed = 0;
+bool floored = false;
 """

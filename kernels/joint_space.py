@@ -31,6 +31,11 @@ point comes out slowly."""
 LAW = 5
 """Entries of a law f(u) = scale clip(force - resistance u, least, most): force, resistance, least, most, scale."""
 DOF_FIELDS, SLOT_FIELDS = 12, 13
+RIGID = {wp.float32: 1e4, wp.float64: 1e12}
+"""How many times the inertia that a point feels friction resists at most, in a step. At this bound a point that sticks
+creeps by a part of 1e4 of the speed that an impact takes; an inertia beside more would be lost in rounding."""
+FLOOR = {wp.float32: 1e-4, wp.float64: 1e-10}
+"""Share of a dof's inertia at the neutral pose that a pivot is at least. It may be less only by rounding."""
 DOF_VALUES = (
     "stiffness", "rest", "damping", "ke", "kd", "effort", "dry", "fastest", "brake", "weight",
     "lower", "upper", "limit_ke", "limit_kd",
@@ -153,6 +158,8 @@ def solver(sizes: Sizes, T: type, lanes: int = 32, registers: int | None = None,
     text = text.replace("UNROLL\n", "#pragma unroll\n").replace("LOOP\n", "#pragma unroll 1\n")
     text = (
         text.replace("AWAY", "(REAL)INFINITY")
+        .replace("(REAL)RIGID", f"(REAL){RIGID[T]:g}")
+        .replace("(REAL)FLOOR", f"(REAL){FLOOR[T]:g}")
         .replace("LANE_COUNT", str(lanes))
         .replace("REAL", c)
         .replace("FMA(", f"FUSED_{c}(")

@@ -1,9 +1,9 @@
 """Pairs of shapes that are near each other, and the points that they share, for :mod:`.joint_space`.
 
 A warp a world looks at the balls around the shapes of all pairs, and at the box around each and the ball around the
-other, and lists those that are near, in the order of the scene; where more are near than the list takes, those that
-overlap most stay. A thread a near pair then finds
-its points by :mod:`.convex_pairs`. The lists do not depend on the order of threads.
+other, and lists those that are near, in the order of the scene. Where more are near than the list takes, those stay
+whose balls and boxes overlap most now, whatever their speeds, and of those that overlap equally the first ones. A
+thread a near pair then finds its points by :mod:`.convex_pairs`. The lists do not depend on the order of threads.
 
 Two shapes are near where they are no farther apart than ``slack``, and what both can move in a step, twice: a body
 that another one strikes leaves it at most twice as fast as it was struck.
@@ -94,9 +94,9 @@ const long long world = thread / LANES;
 if (world >= worlds) return;
 struct balls
 {
-    // By how much the balls around two shapes overlap once each has come as far as it may.
-    static CUDA_CALLABLE inline REAL overlap(const REAL* poses, const REAL* rates, const int* which, const REAL* sides,
-        int pair, REAL slack, REAL h)
+    // By how much the balls around two shapes overlap, or the ball around one and the box around the other, if less.
+    static CUDA_CALLABLE inline REAL overlap(const REAL* poses, const int* which, const REAL* sides, int pair,
+        REAL reach)
     {
         REAL at[6];
         for (int side = 0; side < 2; ++side) {
@@ -106,46 +106,67 @@ struct balls
         const REAL *const one = sides + 2 * pair * SIDE, *const other = one + SIDE;
         const REAL from[3] = {at[3] - at[0], at[4] - at[1], at[5] - at[2]}, back[3] = {-from[0], -from[1], -from[2]};
         const REAL apart = sqrt(from[0] * from[0] + from[1] * from[1] + from[2] * from[2]);
-        const REAL reach = turned::reach(rates, which, sides, pair, slack, h);
-        REAL found = one[SIDE - 1] + other[SIDE - 1] - apart + reach;
-        if (!(found > 0)) return found;
+        REAL found = one[SIDE - 1] + other[SIDE - 1] - apart;
+        if (!(found + reach > 0)) return found;
         const int a = which[2 * pair * WHICH], b = which[(2 * pair + 1) * WHICH];
-        const REAL there = other[SIDE - 1] + reach - turned::outside(a < 0 ? nullptr : poses + 7 * a, one, from);
-        const REAL here = one[SIDE - 1] + reach - turned::outside(b < 0 ? nullptr : poses + 7 * b, other, back);
+        const REAL there = other[SIDE - 1] - turned::outside(a < 0 ? nullptr : poses + 7 * a, one, from);
+        const REAL here = one[SIDE - 1] - turned::outside(b < 0 ? nullptr : poses + 7 * b, other, back);
         found = there < found ? there : found;
         return here < found ? here : found;
+    }
+
+    // A number that grows with an overlap in float32, as its bits do.
+    static CUDA_CALLABLE inline unsigned int order(REAL overlap)
+    {
+        const float x = (float)overlap;
+        unsigned int bits;
+        memcpy(&bits, &x, sizeof(bits));
+        return bits & 0x80000000u ? ~bits : bits | 0x80000000u;
     }
 };
 const REAL* const own = poses.data + world * poses.shape[1] * 7;
 int* const list = near.data + world * (1 + 2 * NEAR);
 const REAL* const rates = velocities.data + world * velocities.shape[1] * 6;
-REAL least = 0, none = 1e9;
-for (int round = 0, rounds = 1; round < rounds; ++round) {
+// Rounds: all that are near; where these are too many, the largest bound that NEAR of them reach, a bit a round, and
+// then those beyond it, and as many of those that equal it as there is room for.
+unsigned int bound = 0;
+int beyond = 0, rounds = 1;
+for (int round = 0; round < rounds; ++round) {
     const bool last = round == rounds - 1;
-    const REAL bound = round == 0 || last ? least : (REAL)0.5 * (least + none);
-    int found = 0;
+    const unsigned int bit = round == 0 || last ? 0 : 1u << (32 - round), tried = bound | bit;
+    int found = 0, equal = 0;
     for (int begin = 0; begin < PAIRS; begin += LANES) {
         const int pair = begin + lane;
-        const bool close = pair < PAIRS && balls::overlap(own, rates, place.data, sides.data, pair, slack, h)
-            > bound;
+        bool more = false, same = false;
+        if (pair < PAIRS) {
+            const REAL reach = turned::reach(rates, place.data, sides.data, pair, slack, h);
+            const REAL overlap = balls::overlap(own, place.data, sides.data, pair, reach);
+            const unsigned int order = balls::order(overlap);
+            if (overlap + reach > 0) {
+                same = round > 0 && last && order == tried;
+                more = round == 0 || (last ? order > tried : order >= tried);
+            }
+        }
 #if defined(__CUDA_ARCH__)
-        const unsigned int all = __ballot_sync(0xffffffffu, close);
-        const int before = found + __popc(all & ((1u << lane) - 1));
+        const unsigned int all = __ballot_sync(0xffffffffu, more), ties = __ballot_sync(0xffffffffu, same);
+        const unsigned int earlier = (1u << lane) - 1;
+        const int tied = equal + __popc(ties & earlier), room = NEAR - beyond;
+        const int before = found + __popc(all & earlier) + (tied < room ? tied : room);
         found += __popc(all);
+        equal += __popc(ties);
 #else
-        const int before = found;
-        found += close;
+        const int tied = equal, room = NEAR - beyond, before = found + (tied < room ? tied : room);
+        found += more;
+        equal += same;
 #endif
-        if ((round == 0 || last) && close && before < NEAR) list[1 + before] = pair;
+        if ((round == 0 || last) && (more || (same && tied < room)) && before < NEAR) list[1 + before] = pair;
     }
     if (round == 0) {
         if (lane == 0) list[0] = found;
-        if (found > NEAR) rounds = 34;  // which bound leaves as many as the list takes
+        if (found > NEAR) rounds = 34;
     } else if (!last) {
-        (found > NEAR ? least : none) = bound;
-        if (round == rounds - 2) least = none;
-    } else {
-        for (int k = found + lane; k < NEAR; k += LANES) list[1 + k] = -1;
+        if (found >= NEAR) bound = tried;
+        else beyond = found;  // the last ones that are too few lie beyond the bound
     }
 }
 #undef LANES

@@ -105,7 +105,7 @@ def settle(scene: spo.Scene, q: np.ndarray, target: np.ndarray, steps: int) -> t
     state, rates, aim = array(q), array(np.zeros((len(q), scene.dof_count))), array(target)
     after = wp.zeros_like(state)
     for _ in range(steps):
-        wp.copy(rates, solver.step(state, rates, None, (aim, None), DT, q_out=after))
+        solver.step(state, rates, None, (aim, None), DT, after=(after, rates))
         wp.copy(state, after)
     return state.numpy(), rates.numpy()
 
@@ -168,14 +168,20 @@ class Run:
     def measure(self, lanes: int, refine: int, registers: int | None) -> dict[str, Any]:
         """Return times of the parts of a step [us], and its errors."""
         solver = self.solver(lanes, refine, registers)
-        q, qd, tau, aim, after = self.q, self.qd, self.tau, (self.target, None), wp.zeros_like(self.q)
-        solver.step(q, qd, tau, aim, DT, q_out=after)
+        q, qd, tau, aim, after = (
+            self.q,
+            self.qd,
+            self.tau,
+            (self.target, None),
+            (wp.zeros_like(self.q), wp.zeros_like(self.qd)),
+        )
+        solver.step(q, qd, tau, aim, DT, after=after)
         found = solver.qd_out.numpy()
         parts = {
             "system": lambda _: solver.find_system(q, qd, DT),
             "points": lambda _: solver.find_points(DT),
             "solve": lambda _: solver.solve(q, qd, tau, aim, DT),
-            "step": lambda _: solver.step(q, qd, tau, aim, DT, q_out=after),
+            "step": lambda _: solver.step(q, qd, tau, aim, DT, after=after),
         }
         sizes = solver.tables.sizes
         return {

@@ -228,7 +228,7 @@ def test_users_get_it_where_many_links_are_tied(device):
         dense.append(wanted.on.sum())
     assert min(dense) >= 28 and (found["status"] == spo.Status.OK).all()
     line = next(line for line in dyn.explain().splitlines() if line.startswith("contacts"))
-    assert "16 of 28 pairs may be near each other in a world, and 64 points of them have slots" in line
+    assert "28 of 28 pairs may be near each other in a world, and 64 points of them have slots" in line
 
 
 def test_small_scenes_keep_generated_code():

@@ -534,21 +534,22 @@ def test_terms_in_torch_see_the_new_state():
 def test_the_first_gap_of_two_bodies_is_that_of_the_new_state():
     env = make_pair_env()
     q = env.q.numpy()
-    np.testing.assert_allclose(env.get_observations()["a"][:, 0].numpy(), find_gap_of_spheres(q), atol=FLOAT32)
+    np.testing.assert_allclose(env.get_observations()["a"][:, 0].numpy(), find_gap_of_boxes(q), atol=FLOAT32)
     env.step(torch.zeros(3, 1))
     observed, _ = env.reset(torch.tensor([True, False, True]))
-    np.testing.assert_allclose(
-        observed["a"][[0, 2], 0].numpy(), find_gap_of_spheres(env.q.numpy())[[0, 2]], atol=FLOAT32
-    )
+    np.testing.assert_allclose(observed["a"][[0, 2], 0].numpy(), find_gap_of_boxes(env.q.numpy())[[0, 2]], atol=FLOAT32)
+    env.q[1, 1] = 5.0
+    observed, _, ended, _ = env.step(torch.zeros(3, 1))
+    assert torch.isinf(env._tensors["contact_gap"][1]).all() and not ended.any()
+    assert observed["a"][1, 0] == 1.0 and (observed["a"][[0, 2], 0] < 0.2).all()
 
 
 def make_pair_env():
-    """Two balls of 0.1 m on one rail."""
+    """Two boxes of 0.1 m on one rail."""
     ball = lambda name: spo.Body(1.0, inertia=0.01 * np.eye(3), label=name)  # noqa: E731
     rail = lambda body: spo.Hinge("prismatic", -1, body, axis=(1, 0, 0), label=f"rail{body}")  # noqa: E731
-    touch = spo.Contact(
-        0, sphere=((0, 0, 0), 0.1), other=spo.Contact(1, sphere=((0, 0, 0), 0.1)), stiffness=1e4, damping=10.0
-    )
+    half = (0.1, 0.1, 0.1)
+    touch = spo.Contact(0, box=half, other=spo.Contact(1, box=half), stiffness=1e4, damping=10.0)
     scene = spo.Scene([ball("a"), ball("b")], [rail(0), rail(1)], contacts=[touch])
     return cart_env(
         3, scene=scene, actions=actions.Effort("rail0"), default_q=[0.0, 0.3], rewards={}, terminations={},
@@ -556,7 +557,7 @@ def make_pair_env():
     )  # fmt: skip
 
 
-def find_gap_of_spheres(q):
+def find_gap_of_boxes(q):
     return q[:, 1] - q[:, 0] - 0.2
 
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .compile.memory_layout import MemoryLayout
 
 ACTIONS = ("action", "action 1", "action 2")  # names under which a world remembers its actions, the newest first
+FAR = 1.0  # gap [m] of pairs of bodies that are farther apart, or too far for a step to look for it
 
 
 class Frame(NamedTuple):
@@ -65,8 +66,9 @@ class World:
         contact_force: [point, 3], inertial axes, mean over substeps [N]. contact_gap: [point] distance from the ground
             [m], where the last substep began. contact_slip: [point], speed along the ground [m/s]. Points are those of
             ``scene.contact_points``, and after them ``scene.contact_pairs``, each as one: the force is on the first
-            body, the gap infinite where the two share no point. In the first observation of an episode gaps and slips
-            are those of its state; there is no force, and pairs do not slip.
+            body, the gap at most FAR, 1 m, which it also is where a step finds it infinite because the two are too
+            far apart to share a point. In the first observation of an episode gaps and slips are those of its state;
+            there is no force, and pairs do not slip.
         time: since the last reset [s].
         dt: of a step of the environment [s].
         values: in events that change values: arrays by name, of abstract scalars or numbers, whose entries they assign.
@@ -188,7 +190,8 @@ class World:
 
     @functools.cached_property
     def contact_gap(self) -> Vector:
-        return self.read("contact_gap", self._contact_count())
+        gaps, points = self.read("contact_gap", self._contact_count()), len(self.scene.contact_points)
+        return vector([*gaps[:points], *(where(gap > FAR, FAR, gap) for gap in gaps[points:])])
 
     @functools.cached_property
     def contact_slip(self) -> Vector:

@@ -11,7 +11,6 @@ import warp as wp
 from ...execution.joint_tables import joint_tables, lacking, motor_laws
 from ...execution.routine import Routine
 from ...kernels import convex_pairs, joint_space, near_pairs
-from ...recursions import coordinates
 from ...recursions.contact import coupled, joint_system
 from ...recursions.contact.pairs import PASSES, RESIDUAL
 from ...recursions.contact.points import surface_numbers
@@ -28,17 +27,19 @@ from ..kinematics import BODY_STATES
 if TYPE_CHECKING:
     from ..dynamics import Dynamics
 
-INTEGRATE = Routine("integrate", coordinates.integrate)
 SYSTEM = Routine("joint_system", joint_system.joint_system)
+STATE_AFTER = Routine("joint_state_after", joint_system.state_after)
 FEW, MOST_SHARED = 8192, 96 * 1024
 """Worlds up to which each takes a warp; shared memory of a block above which it does, too [bytes]. Not measured yet."""
 ROOM = 227 * 1024  # shared memory of a block [bytes]
 MARGIN = 5e-3  # how near shapes are looked at whatever their speeds [m]; a drive at 1000 m/s^2 moves so far in 3 ms
 TINY = 1e-9  # radius of a point among shapes [m]
 NO_ROOM = "a world in joint space is larger than the shared memory of a block"
-NEAR, NEAR_A_BODY, FULL = 16, 2, 8
-"""Pairs that may be near in a world: so many, or so many for each body of a pair. Of FULL of them, or of as many as
-there are such bodies, all points have slots. In a pile a body lies on one or two others, mostly with four points."""
+NEAR, NEAR_A_BODY = 256, 4
+"""Pairs that may be near in a world: so many, or so many for each body of a pair. One takes 240 bytes in float32."""
+FULL, LEAST, LEAST_A_BODY = 8, 16, 2
+"""Of FULL pairs, or of as many as there are bodies of a pair, all points have slots. In a pile a body lies on one or
+two others, mostly with four points. Where shared memory is short, LEAST slots, or LEAST_A_BODY for each body, stay."""
 
 
 def reason_against(scene: Scene, variable: tuple[str, ...]) -> str:
@@ -110,8 +111,9 @@ class JointSpaceStep:
         self.motor_laws = motors = motor_laws(scene, dyn.variable)
         tables = joint_tables(scene, pattern, near, slots, surfaces, motors)
         sizes = tables.sizes
-        while self.device.is_cuda and slots > near and joint_space.world_bytes(sizes, T) > ROOM:
-            self.slot_count = slots = max(near, slots - 8)
+        least = min(slots, max(LEAST, LEAST_A_BODY * len(scene.bodies)))
+        while self.device.is_cuda and slots > least and joint_space.world_bytes(sizes, T) > ROOM:
+            self.slot_count = slots = max(least, slots - 8)
             sizes = sizes._replace(slots=slots + sizes.surfaces)
         self.tables = tables = tables._replace(sizes=sizes)
         crowded = 2 * joint_space.world_bytes(sizes, T) > MOST_SHARED
@@ -209,9 +211,9 @@ class JointSpaceStep:
         passes: int = PASSES,
         results: dict[str, wp.array] | None = None,
     ) -> None:
-        """Compute qd after the step and reports from mass, bias, surfaces, poses, and points.
+        """Compute the rates that the passes find, ``qd_out``, and reports from mass, bias, surfaces, poses, and points.
 
-        ``results``: arrays in place of ``qd_out``, ``qdd``, ``contact_f`` and further attributes, by name.
+        ``results``: arrays in place of ``qdd``, ``contact_f`` and further attributes, by name.
         """
         tau, (target_q, target_qd) = self.still if tau is None else tau, targets
         system = [self.mass, self.bias, tau, q, qd, self.neutral if target_q is None else target_q]
@@ -251,19 +253,22 @@ class JointSpaceStep:
         targets: tuple[wp.array | None, wp.array | None],
         dt: float,
         passes: int = PASSES,
-        q_out: wp.array | None = None,
+        after: tuple[wp.array, wp.array] | None = None,
         body_f: wp.array | None = None,
         ctrl: wp.array | None = None,
         results: dict[str, wp.array] | None = None,
     ) -> wp.array:
-        """Return qd after the step; with ``q_out`` also q. ``targets``: q and qd of the drives, None is the neutral."""
+        """Return the rates that the passes find.
+
+        ``targets``: q and qd of the drives, None is the neutral. ``after``: arrays for q and qd after the step.
+        """
         self.find_system(q, qd, dt, body_f=body_f, ctrl=ctrl, target_q=targets[0], target_qd=targets[1])
         self.find_points(dt)
         self.solve(q, qd, tau, targets, dt, passes, results)
-        after = (results or {}).get("qd_out", self.qd_out)
-        if q_out is not None:
-            self.dyn._engine.launch_routine(INTEGRATE, q_out, q=q, qd=after, dt=dt)
-        return after
+        if after is not None:
+            passed = {joint_system.PASSED: self.qd_out}
+            self.dyn._engine.launch_routine(STATE_AFTER, after[1], {"q_out": after[0]}, q=q, qd=qd, dt=dt, **passed)
+        return self.qd_out
 
     def launch(
         self,
@@ -284,8 +289,8 @@ class JointSpaceStep:
             if name in reports:
                 launches.fill(reports[name], 0)
         renamed = {"contact_excess": "excess"}
-        results = {renamed.get(name, name): array for name, array in reports.items()} | {"qd_out": after[1]}
-        self.step(q, qd, tau, (target_q, target_qd), dt, passes, after[0], body_f, ctrl, results)
+        results = {renamed.get(name, name): array for name, array in reports.items()}
+        self.step(q, qd, tau, (target_q, target_qd), dt, passes, after, body_f, ctrl, results)
 
     @property
     def fits(self) -> bool:

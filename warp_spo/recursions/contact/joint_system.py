@@ -15,6 +15,7 @@ from ...trace.scalars import Value, is_constant, sqrt
 from ...trace.spatial import IDENTITY, ZERO, Vector, dot, total
 from ..kinematics import columns, zero
 from ..newton_euler import inverse_dynamics
+from ..step import descendants
 from ..step.actuation import build_joint_laws
 from ..step.joint_laws import JointLaws, Law, add_laws
 from .pairs import place_axes_of
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 SCREWS, SURFACES, OF_MOTORS = "screws", "surfaces", "motors"
 OF_DOFS, OF_PAIRS = "dof_values", "pair_values"
+PASSED = "passed"  # array [world, dof]: qd + h qdd, as the last pass leaves it
 SCREW = 9  # entries of a dof: what its rate turns, and moves of the place whose coordinates follow, inertial axes
 SURFACE = 11
 """Entries of a surface: place, normal, depth; push and damping of its law; gap; 1 where the point comes out slowly."""
@@ -75,6 +77,20 @@ def joint_system(
         first = len(trace.links.scene.contact_points)
         rows = [*(first + pair for pair in pairs), *numbers]
         stores += [*_dof_values(trace, laws, names[0]), *_pair_values(trace, laws, names[1], rows)]
+    return stores
+
+
+def state_after(trace: Trace) -> list[Store]:
+    """out = qd', q_out = q' for the rates PASSED of the last pass
+
+    Bodies that turn freely, and those on links that move, end as in steps by sweeps, see :mod:`..step.descendants`.
+    """
+    q, qd, passed, h = *map(trace.vector, ("q", "qd", PASSED)), trace.graph.input("dt", 0)
+    rates = {dof: passed(dof) for link in trace.links.leaders for dof in link.dofs}
+    stores: list[Store] = []
+    for link, coordinates, after in descendants.states_after(trace, list(trace.links.leaders), q, qd, rates, h):
+        stores += [Store("out", (dof,), rate) for dof, rate in zip(link.dofs, after, strict=True)]
+        stores += [Store("q_out", (link.coordinate + c,), value) for c, value in enumerate(coordinates)]
     return stores
 
 

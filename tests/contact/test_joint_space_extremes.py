@@ -1,0 +1,79 @@
+"""Bodies that touch, solved in joint space: more near pairs than a list takes, and flight without touch."""
+
+import numpy as np
+import warp as wp
+
+import warp_spo as spo
+from support.pair_scenes import H, cube, free
+from warp_spo.dynamics.stepping.joint_space import JointSpaceStep
+
+EXACT = 1e-13  # of coordinates and rates of size 10 in float64, of the same step by other code; 1e-15 measured
+FAST = 1e-4  # of rates in float32 over the speed of an impact; 7e-6 measured
+
+
+def test_the_nearest_pairs_stay_where_the_list_is_too_short(device):
+    """Balls in a table by so many millimetres; the last one is above it, and fast enough to be near in this step."""
+    depths, room = 1e-3 * np.array([[1.0, 2.0, 2.0, 3.0, 2.0, -20.0], [3.0, 1.0, -1.0, 1.0, 0.5, -20.0]]), 3
+    kept = [[1, 2, 3], [0, 1, 3]]  # the deepest; of equal ones the first
+    table = spo.Contact(-1, box=((2.0, 2.0, 0.5), (0.0, 0.0, -0.5, 0.0, 0.0, 0.0, 1.0)))
+    balls = [spo.Contact(i, sphere=0.05, other=table, stiffness=1e4, damping=0.0) for i in range(6)]
+    scene = free([cube(1.0, 0.05)] * 6, balls)
+    q, qd = np.tile(scene.neutral_q, (2, 1)), np.zeros((2, scene.dof_count))
+    q[:, ::7], q[:, 2::7], qd[:, 32] = 0.2 * np.arange(6), 0.05 - depths, -20.0
+    for dtype in ("float32", "float64"):
+        dyn = spo.Dynamics(scene, 2, device, dtype)
+        dyn._joint_space = JointSpaceStep(dyn, near=room, slots=6)
+        status, force = np.zeros(2, np.int32), dyn.step_report("contact_f", like=q)
+        dyn.step(q, qd, None, H, status=status, report=force)
+        lists = dyn._joint_space.near.numpy().reshape(2, -1)
+        assert lists[:, 0].tolist() == [6, 6] and lists[:, 1 : 1 + room].tolist() == kept
+        assert (status == spo.Status.SLOTS).all()
+        assert [np.flatnonzero(each).tolist() for each in force.contact_f[:, :, 2]] == kept
+
+
+def test_bodies_that_touch_nothing_move_as_without_contacts(device):
+    """One that tumbles about a CoM beside its frame, one about a ball joint, an arm, and one that flies off the arm."""
+    slim, worlds, rng = np.diag([0.001, 0.01, 0.01]), 4, np.random.default_rng(0)
+    bodies = [spo.Body(2.0, com=(0.02, 0.01, 0.0), inertia=slim), *(spo.Body(1.0, inertia=slim) for _ in range(3))]
+    bodies.append(spo.Body(1.0, inertia=np.diag([0.002, 0.01, 0.011])))
+    hinges = [spo.Hinge("free", -1, 0), spo.Hinge("ball", -1, 1), spo.Hinge("revolute", -1, 2, axis=(0, 1, 0)),
+              spo.Hinge("revolute", 2, 3, axis=(1, 0, 0)), spo.Hinge("free", 2, 4)]  # fmt: skip
+    apart = spo.Contact(0, sphere=0.03, other=spo.Contact(1, sphere=0.03))
+    alone, scene = (spo.Scene(bodies, hinges, contacts=contacts) for contacts in ([], [apart]))
+    q, qd = np.tile(scene.neutral_q, (worlds, 1)), 4.0 * rng.normal(size=(worlds, scene.dof_count))
+    turn = rng.normal(size=(worlds, 4))
+    q[:, 0], q[:, 3:7] = 50.0, turn / np.linalg.norm(turn, axis=1)[:, None]
+    found = []
+    for each in (alone, scene):
+        dyn = spo.Dynamics(each, worlds, device, "float64")
+        if each is scene:
+            dyn._joint_space = JointSpaceStep(dyn)
+        report = dyn.step_report("qdd", like=q)
+        found.append((*dyn.step(q, qd, None, H, report=report), H * report.qdd))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, atol=EXACT)
+    given = [wp.array(x, dtype=wp.float64, device=device) for x in (q, qd)]
+    dyn.step(*given, None, H, out=tuple(given))
+    for one, other in zip(given, found[1], strict=False):
+        np.testing.assert_array_equal(one.numpy(), other)
+
+
+def test_fast_impacts_are_finite_in_float32(device):
+    """A box of 1 kg flies square against one of 8 kg, whose friction then resists millions of times their masses."""
+    bodies, half = [cube(1.0, 0.05), cube(8.0, 0.1)], ((0.05,) * 3, (0.1,) * 3)
+    scene = free(bodies, [spo.Contact(0, box=half[0], other=spo.Contact(1, box=half[1]))])
+    speed, rng = np.repeat([10.0, 20.0, 40.0], 12), np.random.default_rng(0)
+    q, qd = np.tile(scene.neutral_q, (len(speed), 1)), np.zeros((len(speed), 12))
+    q[:, 0], qd[:, 0] = -0.151 - 0.01 * speed * rng.uniform(0.0, 1.0, len(speed)), speed
+    q, qd, found = np.float64(np.float32(q)), qd + 0.01 * np.float64(np.float32(rng.normal(size=qd.shape))), {}
+    qd = np.float64(np.float32(qd))
+    for dtype in ("float32", "float64"):
+        dyn = spo.Dynamics(scene, len(speed), device, dtype)
+        dyn._joint_space, state = JointSpaceStep(dyn), (q, qd)
+        for _ in range(3):
+            status = np.zeros(len(speed), np.int32)
+            state = dyn.step(*state, None, 0.01, status=status)
+            assert not np.isin(status, [spo.Status.PIVOT, spo.Status.NOT_FINITE]).any()
+        found[dtype] = state[1]
+    error = np.abs(found["float32"] - found["float64"]).max(axis=1) / speed
+    assert (error < FAST).all()
