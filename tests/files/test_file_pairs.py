@@ -22,6 +22,7 @@ from warp_spo.newton.model_contacts import ModelShapes
 from warp_spo.newton.pairs import select_pairs
 from warp_spo.newton.worlds import WorldRows
 from warp_spo.scene.collision_shapes import moving_bodies
+from warp_spo.scene.extreme_points import spread_directions
 from warp_spo.scene.hulls import _remembered_hull
 from warp_spo.scene.shape_pairs import PairSelection
 
@@ -312,17 +313,18 @@ def test_no_warning_where_bodies_only_touch_the_ground(recwarn):
 def test_what_pairs_do_not_take_is_said():
     """Shapes without a narrow phase of steps, friction against turning, softness, contacts that the file disables."""
     turning = TEXT.replace('name="palm" size=".1"', 'name="palm" size=".1" condim="4" solref=".1 1"')
-    can = turning.replace(
-        "</worldbody>", '<body><freejoint/><geom name="can" type="cylinder" size=".1 .1"/></body></worldbody>'
-    )
-    model = mujoco.MjModel.from_xml_string(can.format("", ""))
+    points = " ".join(f"{x:.4f}" for x in np.ravel(0.1 * spread_directions(100)))
+    stone = turning.replace(
+        "</worldbody>", '<body><freejoint/><geom name="stone" type="mesh" mesh="stone"/></body></worldbody>'
+    ).replace("<worldbody>", f'<asset><mesh name="stone" vertex="{points}"/></asset><worldbody>')
+    model = mujoco.MjModel.from_xml_string(stone.format("", ""))
     with pytest.warns(UserWarning) as found:
         scene = spo.from_mujoco(model, pairs="all")
     (words,) = {str(one.message) for one in found}
     assert "torsional friction, solref of 1 pair(s) of shapes, such as sphere 'palm' of body 'hand' with box" in words
-    assert "contacts of 2 pair(s) of shapes, such as sphere 'palm' of body 'hand' with cylinder 'can'" in words
+    assert "contacts of 2 pair(s) of shapes, such as sphere 'palm' of body 'hand' with hull 'stone'" in words
     assert len(scene.contact_pairs) == 1
-    disabled = can.replace("<worldbody>", '<option><flag contact="disable"/></option><worldbody>')
+    disabled = stone.replace("<worldbody>", '<option><flag contact="disable"/></option><worldbody>')
     model = mujoco.MjModel.from_xml_string(disabled.format("", ""))
     with pytest.warns(UserWarning, match="all contacts, which its options disable"):
         assert not spo.from_mujoco(model, contacts="ground", pairs="all").contacts

@@ -32,7 +32,7 @@ MISTAKES = {
     "filtered": ([("upper", "lower")], ValueError, "groups or filters keep apart, or which are fixed"),
     "fixed": ([("elbow", "pad")], ValueError, "or which are fixed to each other"),
     "still": ([("post", "post")], ValueError, "stands for a shape with itself"),
-    "cylinder": ([("tin", "cube")], UnsupportedError, "cylinder 'tin' of body 'tin' with box .*another solver"),
+    "cone": ([("tin", "cube")], UnsupportedError, "cone 'tin' of body 'tin' with box .*another solver"),
 }
 
 
@@ -71,7 +71,7 @@ def chosen(model, asked):
 def test_all_are_those_that_the_model_lets_collide():
     """No neighbours in the tree, nor what is fixed to each other; what no contact represents is a warning."""
     model = many(arm())
-    with pytest.warns(UserWarning, match=r"leaves out capsule 'stick' of body 'upper' with cylinder 'tin' .* more,"):
+    with pytest.warns(UserWarning, match=r"leaves out capsule 'stick' of body 'upper' with cone 'tin' .* more,"):
         labels, pairs = chosen(model, "all")
     assert labels == ["stick with pad", "stick with box of cube", "stick with ball", "elbow with box of cube",
                       "elbow with ball", "pad with box of cube", "pad with ball", "box of cube with ball"]  # fmt: skip

@@ -71,7 +71,7 @@ def arm():
     ball = one.add_body(label="ball", xform=wp.transform(wp.vec3(0.031, 0.0, 0.525), wp.quat_identity()))
     one.add_shape_sphere(ball, radius=0.05, cfg=config(margin=0.003), label="ball")
     tin = one.add_body(label="tin", xform=wp.transform(wp.vec3(1.0, 0.0, 0.5), wp.quat_identity()))
-    one.add_shape_cylinder(tin, radius=0.05, half_height=0.1, cfg=config(), label="tin")
+    one.add_shape_cone(tin, radius=0.05, half_height=0.1, cfg=config(), label="tin")
     one.add_shape_box(-1, xform=wp.transform(wp.vec3(2.0, 0.0, 0.5), wp.quat_identity()), hx=0.1, hy=0.1, hz=0.1,
                       cfg=config(), label="post")  # fmt: skip
     return one

@@ -23,7 +23,7 @@ from .parts import IDENTITY_POSE, checked_pose
 from .pickling import StoredPart
 from .supports import BOX_GRID, CAPSULE_GRID, CORNER, CYLINDER_GRID, HULL_CORNER, HULL_GRID, RIM, SURFACE, Support
 
-SWEPT_SEGMENT, BOX, HULL = 0, 1, 2
+SWEPT_SEGMENT, BOX, HULL, CYLINDER, ELLIPSOID = range(5)
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])  # of a cube
 FACE = 8  # corners at most of the common part of two rectangles
 FACES = 16  # corners at most of a face of one hull and one of another together
@@ -80,10 +80,13 @@ class ConvexShape(StoredPart):
     """A shape as the narrow phase takes it.
 
     Attributes:
-        kind: BOX, HULL, or SWEPT_SEGMENT: all points within ``radius`` of a segment, which is a point for spheres.
-        pose: of the box, of the hull's middle, or of the segment's middle with the segment along z, in the body [7].
-        size: half the sizes of the box, or of the one around the hull [m]; (0, 0, half the length) of the segment.
-        radius: [m]; 0 of boxes, hulls and points.
+        kind: BOX, HULL, CYLINDER, ELLIPSOID, or SWEPT_SEGMENT: all points within ``radius`` of a segment, which is a
+            point for spheres.
+        pose: of the box, of the hull's middle, of the ellipsoid, or of the middle of the segment or cylinder, along z,
+            in the body [7].
+        size: half the sizes of the box, or of the one around the hull, cylinder or ellipsoid [m]; (0, 0, half the
+            length) of the segment.
+        radius: [m]; 0 of boxes, hulls and points. A cylinder and an ellipsoid grow by it.
         hull: the corners and faces of a hull, about its pose.
     """
 
@@ -96,7 +99,12 @@ class ConvexShape(StoredPart):
     @property
     def has_faces(self) -> bool:
         """Whether it is a box or a hull."""
-        return self.kind != SWEPT_SEGMENT
+        return self.kind in (BOX, HULL)
+
+    @property
+    def is_curved(self) -> bool:
+        """Whether it is a cylinder or an ellipsoid, which the steps in joint space alone take."""
+        return self.kind in (CYLINDER, ELLIPSOID)
 
     @property
     def samples(self) -> np.ndarray:
@@ -215,7 +223,7 @@ class ContactShape(StoredPart):
         Raises:
             ValueError, UnsupportedError: the narrow phase cannot take it.
         """
-        ways = "give a sphere, a capsule, a box or a hull in its place"
+        ways = "give a sphere, a capsule, a cylinder, an ellipsoid, a box or a hull in its place"
         raise UnsupportedError(call, f"a {self.kind} in contact with another body", ways)
 
     def primitive(self, least: float) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
@@ -410,6 +418,7 @@ class CylinderShape(ContactShape):
     kind = "cylinder"
     names: ClassVar[Names] = {"newton": ("CYLINDER",), "mujoco": ("CYLINDER",), "urdf": ("cylinder",)}
     sizes = ("radius", "half_length")
+    pairs = True
 
     @classmethod
     def parse(cls, call: str, value: Any) -> ContactShape:
@@ -460,6 +469,20 @@ class CylinderShape(ContactShape):
     def on_ground(self, margin: float, most: int) -> list[ContactShape]:
         return [dataclasses.replace(self, margin=self.margin + margin, most=most)]
 
+    def grown(self, margin: float) -> ContactShape:
+        return dataclasses.replace(self, margin=self.margin + margin)
+
+    def convex(self, call: str) -> ConvexShape:
+        if self.radii[0] != self.radii[1]:
+            return super().convex(call)
+        along = _swept_segment(self.ends[0], self.ends[1], 0.0)
+        half = float(along.size[2])
+        if half <= ROUNDING * max(self.radii[0], 1.0):
+            raise UnsupportedError(
+                call, "a cylinder without length in contact with another body", "give it a length, or a hull"
+            )
+        return ConvexShape(CYLINDER, along.pose, read_only(np.array([*self.radii, half])), self.margin)
+
     def primitive(self, least: float) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
         segment, radius = _swept_segment(self.ends[0], self.ends[1], 0.0), max(*self.radii, FLAT)
         return self.kind, (radius, max(float(segment.size[2]), FLAT)), tuple(segment.pose.tolist())
@@ -470,6 +493,7 @@ class ConeShape(CylinderShape):
 
     kind = "cone"
     names: ClassVar[Names] = {"newton": ("CONE",)}
+    pairs = False
 
     @staticmethod
     def _radii(radius: float) -> tuple[float, float]:
@@ -576,6 +600,7 @@ class EllipsoidShape(ContactShape):
     kind = "ellipsoid"
     names: ClassVar[Names] = {"newton": ("ELLIPSOID",), "mujoco": ("ELLIPSOID",)}
     sizes = ("half_x", "half_y", "half_z")
+    pairs = True
 
     @classmethod
     def parse(cls, call: str, value: Any) -> ContactShape:
@@ -607,6 +632,13 @@ class EllipsoidShape(ContactShape):
     def on_ground(self, margin: float, most: int) -> list[ContactShape]:
         return [dataclasses.replace(self, margin=self.margin + margin)]
 
+    def grown(self, margin: float) -> ContactShape:
+        return dataclasses.replace(self, margin=self.margin + margin)
+
+    def convex(self, call: str) -> ConvexShape:
+        pose = read_only(np.asarray(self.pose, dtype=np.float64))
+        return ConvexShape(ELLIPSOID, pose, self.half, self.margin)
+
     def primitive(self, least: float) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
         return "ellipsoid", tuple(np.maximum(self.half, FLAT).tolist()), tuple(np.asarray(self.pose).tolist())
 
@@ -636,6 +668,8 @@ def most_points(call: str, first: ConvexShape, second: ConvexShape) -> int:
         return corners
     if first.has_faces and second.has_faces:
         return FACE
+    if first.is_curved or second.is_curved:
+        return PART
     longest = max(one.size[2] for one in (first, second) if not one.has_faces)
     return PART if longest > 0.0 and (first.has_faces or second.has_faces) else 1
 

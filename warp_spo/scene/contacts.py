@@ -37,7 +37,7 @@ class Contact(ShapeArguments):
     Args:
         other: None: the ground. A Contact that gives another body and its shape, and nothing else counts of it; its
             body may be -1, a shape that stands in the inertial frame. An index of a body: the shape of that body's one
-            contact with the ground.
+            contact with the ground. All kinds of shapes but cones.
         friction: ratio of the largest friction force to the normal force.
         torsional_friction: ratio of the largest moment about the normal, against spinning on a point, to the normal
             force [m]; of a round patch that slides about its middle two thirds of friction times its radius. Not with

@@ -12,12 +12,13 @@ import numpy as np
 from ..errors import shown
 from ..reference.convex_overlap import GrownShape, PosedPair
 from .contact_defaults import NeutralPose
-from .contact_shapes import BOX, ConvexShape
+from .contact_shapes import BOX, CYLINDER, ELLIPSOID, SWEPT_SEGMENT, ConvexShape
 from .frames import pose_matrix
 
 DEEP = 1e-3  # an overlap that is said [m]; shapes of one surface, as drawn, overlap by less
 SOME = 60  # directions that are tried first
 NAMED = 4  # pairs in the message
+NAMES = {SWEPT_SEGMENT: "capsule", BOX: "box", CYLINDER: "cylinder", ELLIPSOID: "ellipsoid"}
 
 
 def warn_of_overlaps(call: str, scene: Any, first: int) -> None:
@@ -74,7 +75,7 @@ def _overlaps(scene: Any, first: int) -> Iterator[tuple[float, int]]:
 def _solid(shape: ConvexShape) -> GrownShape:
     """Return a shape of the narrow phase as the reference has it."""
     if shape.hull is None:
-        return GrownShape("box" if shape.kind == BOX else "capsule", shape.size, shape.radius)
+        return GrownShape(NAMES[shape.kind], shape.size, shape.radius)
     solid = GrownShape("hull", shape.size, shape.radius, shape.hull.corners)
     along = np.array([edge[3:6] for face in shape.hull.edges for edge in np.reshape(face, (-1, 7))])
     solid.normals_and_edges = shape.hull.normals, along / np.linalg.norm(along, axis=1)[:, None]

@@ -17,11 +17,12 @@ if TYPE_CHECKING:
 
 MOST = 32
 """Pairs at most that "all" stands for: what compiles in seconds. Nine boxes, 36 pairs, took 11 s on a CPU."""
+CURVED = ("cylinder", "ellipsoid")  # kinds of which steps in joint space alone take pairs
 KINDS = tuple(kind for kind, shape in SHAPES.items() if shape.names and shape.pairs)
 """Kinds of shapes that pairs may have."""
 WAYS = (
-    "pairs are of spheres, capsules, boxes and convex meshes: put such shapes in place of others, or use another "
-    "solver; contacts='ground' is for planes and height fields"
+    "pairs are of spheres, capsules, cylinders, ellipsoids, boxes and convex meshes: put such shapes in place of "
+    "others, or use another solver; contacts='ground' is for planes and height fields"
 )
 HULL_WAYS = (
     "make it convex or coarser first, such as by builder.approximate_meshes('convex_hull') of a mesh with few vertices "
@@ -144,7 +145,8 @@ class PairSelection:
 
     def reason_against(self, scene: Scene, pairs: Sequence[ShapePair]) -> str:
         """Return why steps do not take a scene with so many pairs; "" if they do."""
-        return "" if len(pairs) <= MOST or self.why_few is None else self.why_few(scene)
+        curved = any(shape.kind in CURVED for pair in pairs for shape in pair)
+        return self.why_few(scene) if self.why_few is not None and (curved or len(pairs) > MOST) else ""
 
     def missed(self, why: str = "") -> list[str]:
         """Return in words that the scene has no contacts of bodies which may touch each other; nothing without any."""

@@ -94,6 +94,10 @@ def refuse(dyn: Dynamics, call: Call, integrator: str) -> None:
     if forced == "node":
         raise UnsupportedError(call.name, f"granularity={forced!r} with contacts", "use another one, or leave it out")
     apart = bool(dyn.scene.contact_pairs) and dyn._joint_space is None  # no solver of its own, whatever the granularity
+    if apart and any(shape.is_curved for pair in dyn.scene.contact_pairs for shape in pair.shapes):
+        why = reason_against(dyn.scene, dyn.variable) or NO_ROOM
+        what = f"cylinders and ellipsoids in contact with other bodies ({why})"
+        raise UnsupportedError(call.name, what, "give capsules, boxes or hulls in their place")
     if forced == "segment" and apart and not by_limbs(dyn.scene):
         what = "granularity='segment' where pairs of bodies are not all on limbs of one link, or more than eight"
         raise UnsupportedError(call.name, what, "leave it out")

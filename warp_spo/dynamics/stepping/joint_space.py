@@ -17,7 +17,7 @@ from ...recursions.contact.points import surface_numbers
 from ...recursions.contact.step import TOLERANCE
 from ...recursions.model.links import Links
 from ...runtime import launches
-from ...scene.contact_shapes import BOX, ConvexShape
+from ...scene.contact_shapes import BOX, CYLINDER, ELLIPSOID, SWEPT_SEGMENT, ConvexShape
 from ...scene.ground import HEIGHTS
 from ...scene.scene import Scene
 from ..convex_contacts import PairShape, rotate, shape_rows
@@ -70,7 +70,7 @@ def choose_slots(scene: Scene) -> tuple[int, int]:
 
 def _points(one: ConvexShape, other: ConvexShape) -> int:
     """Return how many points two shapes share at most."""
-    round_ones = [not shape.has_faces and shape.size[2] == 0.0 for shape in (one, other)]
+    round_ones = [shape.kind == SWEPT_SEGMENT and shape.size[2] == 0.0 for shape in (one, other)]
     if any(round_ones):
         return 1
     return convex_pairs.POINTS if one.kind == other.kind == BOX else 4
@@ -314,5 +314,9 @@ def _pair_shape(shape: ConvexShape) -> PairShape:
         return PairShape("hull", shape.hull.corners)
     if shape.has_faces:
         return PairShape("box", shape.size)
+    if shape.kind == ELLIPSOID:
+        return PairShape("ellipsoid", shape.size, shape.radius)
+    if shape.kind == CYLINDER:
+        return PairShape("cylinder", (shape.size[0], shape.size[2]), shape.radius)
     radius, half = max(shape.radius, TINY), float(shape.size[2])
     return PairShape("capsule", (radius, half)) if half > 0.0 else PairShape("sphere", (radius,))

@@ -43,6 +43,8 @@ def is_supported(links: Links) -> bool:
              for p in links.scene.contact_pairs)  # fmt: skip
     if any(link.shared_dofs is not None for link in links.links) or not all(map(any, pairs)):
         return False
+    if any(shape.is_curved for pair in links.scene.contact_pairs for shape in pair.shapes):
+        return False
     return TiePlan(links, couples_of(links)).work <= MOST_WORK
 
 
