@@ -34,6 +34,7 @@ NUMBERS = {
     "LACKS": 0.1,  # share of that by which a polygon's depth may be less than that of the shapes
     "GAP": GAP,
     "SKIMS": 0.04,  # share of the least half size up to which shapes that touch may pass beside each other
+    "LIES": 0.01,  # share of the least half size up to which shapes that overlap, and come nearer, may pass, too
     "TURNED": 0.3,  # rad in a step up to which a body that turns is moved without that
     "NONE": 1e9,  # overlap of directions that are not there [m]
 }

@@ -1,10 +1,11 @@
-"""Whether two convex shapes that are apart pass beside each other, for :mod:`.convex_pairs`.
+"""Whether two convex shapes that are apart, or hardly overlap, pass beside each other, for :mod:`.convex_pairs`.
 
 The plane between two shapes has no end, the shapes have: a box that flies over an edge, or slides over the seam of two
 tables, crosses the plane of a side without touching it. So the pair is moved, without turning, until it touches, by
 steps of the distance over the speed along the normal (conservative advancement, B. Mirtich 1996), and then as much as
 would carry it into each other by SKIMS of the smaller shape's least half size. If it does not touch within the step, or
-is then less than half as deep as the speed along the normal says, it passes by.
+is then less than half as deep as the speed along the normal says, it passes by. Shapes that overlap by up to LIES are
+looked at as well: where a body lies a little below the top that it slides onto, the side may be the nearest way out.
 """
 
 NATIVE = r"""
@@ -42,12 +43,13 @@ NATIVE = r"""
         }
     };
 
-    // Finds the point that comes nearest in the step, and the relative velocity there; returns whether all are apart
-    // and it meets. Not of bodies that turn by more than TURNED: they are moved without turning.
-    static CUDA_CALLABLE inline bool approach(const Motion& motion, const REAL* points, int count, REAL faint,
+    // Finds the point that comes nearest in the step, and the relative velocity there; returns whether none is
+    // deeper than LIES and it meets. Not of bodies that turn by more than TURNED: they are moved without turning.
+    static CUDA_CALLABLE inline bool approach(const Motion& motion, const REAL* points, int count, REAL least,
         REAL* drift)
     {
-        REAL most = -NONE;
+        const REAL faint = (REAL)FAINT * least, allowed = (REAL)LIES * least;
+        REAL most = -NONE, fastest = 0;
         bool apart = true;
         UNROLL
         for (int side = 0; side < 2; ++side) {
@@ -59,14 +61,15 @@ NATIVE = r"""
             const REAL* point = points + ENTRY * i;
             REAL u[3];
             motion.at(point, u);
-            const REAL deep = point[6] - motion.h * dot(point + 3, u);
-            apart = apart && !(point[6] > 0);
+            const REAL closing = -motion.h * dot(point + 3, u), deep = point[6] + closing;
+            apart = apart && !(point[6] > allowed);
             if (!(deep > most)) continue;
             most = deep;
+            fastest = closing;
             UNROLL
             for (int r = 0; r < 3; ++r) drift[r] = u[r];
         }
-        return apart && most > faint;
+        return apart && fastest > faint && most > -faint;
     }
 
     static CUDA_CALLABLE inline REAL least_of(const Shape& one, const Shape& other)
@@ -94,7 +97,7 @@ NATIVE = r"""
             if (!nearest(two, most, best)) return round > 0;
             const REAL gap = -(best.overlap + two.a.radius + two.b.radius), closing = dot(best.normal, drift);
             if (touched) return -gap < (REAL)0.5 * expected;
-            if (round == 0 && !(gap > 0)) return false;
+            if (round == 0 && gap < (REAL)-2 * (REAL)LIES * least) return false;
             if (!(closing > 0)) return true;
             REAL step = gap / closing;
             if (gap > (REAL)FAINT * least) {
@@ -102,7 +105,8 @@ NATIVE = r"""
             } else {
                 touched = true;
                 step = (REAL)SKIMS * least / closing;
-                step = step < h ? step : h;
+                const REAL room = 4 * (REAL)SKIMS * least / sqrt(dot(drift, drift)), longest = room > h ? room : h;
+                step = step < longest ? step : longest;
                 expected = closing * step - gap;
                 if (!(expected > 4 * (REAL)FAINT * least)) return false;
             }

@@ -237,8 +237,8 @@ for (int side = 0; side < 2; ++side) {
     for (int c = 0; c < 3; ++c) motion.com[side][c] += own[7 * body + c];
 }
 REAL u[3];
-const REAL faint = (REAL)FAINT * convex::least_of(shape[0], shape[1]);
-if (!convex::approach(motion, touches.data + (world * NEAR + k) * (MOST * POINT), list[1 + NEAR + k], faint, u)) return;
+const REAL least = convex::least_of(shape[0], shape[1]);
+if (!convex::approach(motion, touches.data + (world * NEAR + k) * (MOST * POINT), list[1 + NEAR + k], least, u)) return;
 """,
     "LAST": r"""
 if (convex::passes_by(shape[0], shape[1], tables, at[0], turn[0], at[1], turn[1], reach, u, h)) list[1 + NEAR + k] = 0;
@@ -296,4 +296,4 @@ def _pair_text(parts: dict[str, str], pairs: int, near: int, T: type) -> str:
     text = PAIR
     for name, part in parts.items():
         text = text.replace(f"\n{name}\n", f"\n{part.strip()}\n" if part else "\n")
-    return _text(text, pairs, near, T).replace("FAINT", repr(convex_pairs.FAINT[T]))
+    return _text(text, pairs, near, T)
