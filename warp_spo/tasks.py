@@ -43,6 +43,8 @@ def main(arguments: list[str] | None = None) -> int:
                 raise ValueError(f"--new {options.new}: expected a name that ends in .py")
             with options.new.open("x") as file:
                 file.write(text)
+        except FileExistsError:
+            parser.error(f"--new {str(options.new)!r}: there is such a file; expected a new name, or remove it")
         except (ValueError, OSError) as error:
             parser.error(str(error))
         print(f"{options.new}: train it with python -m warp_spo.train {options.new}")

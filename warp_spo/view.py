@@ -36,7 +36,9 @@ def start(arguments: list[str] | None) -> int:
         prog="python -m warp_spo.view", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("robot", metavar="ROBOT", help="a file, or a name")
-    parser.add_argument("--contacts", action="append", metavar="PATTERN", help="shapes that touch the ground; all")
+    parser.add_argument(
+        "--contacts", action="append", metavar="PATTERN", help="shapes that touch the ground alone; all"
+    )
     parser.add_argument("--floating", action=argparse.BooleanOptionalAction, help="whether a URDF's root floats")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on")
     parser.add_argument("--port", type=int, default=8080, help="the first to try; the next free one is taken")
@@ -55,7 +57,7 @@ def start(arguments: list[str] | None) -> int:
         if file.suffix == ".pt":
             return show_failure(file, options)
         more = {} if options.floating is None else {"floating": options.floating}
-        page = view(file, options.host, options.port, options.contacts or "ground", **more)
+        page = view(file, options.host, options.port, options.contacts, **more)
         if options.html is not None:
             options.html.parent.mkdir(parents=True, exist_ok=True)
             options.html.write_text(page.as_html(options.seconds))

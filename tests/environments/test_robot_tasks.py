@@ -7,9 +7,11 @@ torch = pytest.importorskip("torch")
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("warp_spo.env.learning")
 
+import warp_spo as spo  # noqa: E402
 from warp_spo import play, tasks, train  # noqa: E402
 from warp_spo.env import robots  # noqa: E402
 from warp_spo.env.tasks import task  # noqa: E402
+from warp_spo.scene.collision_shapes import floating_bases  # noqa: E402
 
 WHEEL = '<geom type="cylinder" size=".06 .012" euler="90 0 0"/></body>'
 BALANCER = f"""<mujoco><worldbody><geom type="plane" size="0 0 .1"/>
@@ -111,3 +113,25 @@ def test_three_commands_lead_from_a_file_to_a_film_and_an_export(tmp_path, monke
     with Image.open("film.png") as strip:
         shown = np.asarray(strip).astype(int)
     assert (shown[..., 0] > shown[..., 2] + 60).mean() > 1e-3
+
+
+CAN = '<body name="can" pos=".5 0 .2"><freejoint/><geom type="cylinder" size=".03 .05"/></body>'
+FINGER = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/>{}<body name="palm" pos="0 0 .3">
+  <joint name="lift" type="slide" axis="0 0 1" range="-.2 .2"/><geom type="box" size=".1 .02 .02"/>
+  <body pos="0 0 -.1"><joint name="grip" type="slide" axis="1 0 0" range="0 .03"/><geom type="box" size=".01 .02 .05"/>
+  </body></body></worldbody>
+  <actuator><position joint="lift" kp="500"/><position joint="grip" kp="200"/></actuator></mujoco>"""
+
+
+@pytest.mark.filterwarnings("ignore:load")
+def test_an_object_is_no_robot(tmp_path):
+    """A fixed hand holds its pose beside a can; of a can and a robot that floats the robot is the base. Short slides
+    have short strokes."""
+    text = new_file(FINGER.format(CAN), tmp_path).read_text()
+    assert "contacts=True)" in text and "rewards.posture" in text and "track_velocity" not in text
+    assert "scale=[0.2, 0.015]" in text
+    assert 'position=(-0.0333, 0.0333), names="lift"' in text and 'position=(-0.0025, 0.0025), names="grip"' in text
+    file = new_file(BALANCER.replace("<body", CAN + "<body", 1), tmp_path, "second")
+    assert "track_velocity" in file.read_text()
+    scene = spo.load(tmp_path / task(str(file)).ROBOT)
+    assert [scene.body_labels[scene.hinges[i].child] for i in floating_bases(scene)][-1] == "can"

@@ -372,5 +372,11 @@ def test_fingerprints_see_every_part_of_a_scene():
         "dof_angular",
         "dof_linear",
     }
-    of_callers = {"q_index", "dof_index", "sites", "keyframes"}  # kernels of frames are made for the frames of a call
+    of_callers = {
+        "q_index",
+        "dof_index",
+        "sites",
+        "keyframes",
+        "initial_q",
+    }  # kernels of frames are made for the frames of a call
     assert set(vars(zoo.fork())) == seen | derived | of_callers

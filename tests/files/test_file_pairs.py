@@ -331,26 +331,48 @@ def test_what_pairs_do_not_take_is_said():
     assert len(quiet(spo.from_mujoco, model, pairs=[("palm", "side")]).contact_pairs) == 1
 
 
-CROWD = """<mujoco><worldbody><geom type="plane" size="1 1 1"/>{}</worldbody></mujoco>""".format(
-    "".join(f'<body name="b{i}"><freejoint/><geom name="g{i}" size=".1" condim="{{0}}"/></body>' for i in range(9))
-)
+def crowd(count, condim, shape='size=".1"'):
+    """Return MuJoCo's model of free bodies over a floor."""
+    bodies = "".join(
+        f'<body name="b{i}"><freejoint/><geom name="g{i}" {shape} condim="{condim}"/></body>' for i in range(count)
+    )
+    text = f'<mujoco><worldbody><geom type="plane" size="1 1 1"/>{bodies}</worldbody></mujoco>'
+    return mujoco.MjModel.from_xml_string(text)
 
 
 def test_pairs_that_no_step_takes_are_left_out_of_true_and_refused_of_all():
-    """Where the ground has torsional friction; without it, and where there are actuators, many are taken."""
-    model = mujoco.MjModel.from_xml_string(CROWD.format(4))
-    why = "steps of a scene with torsional friction do not solve so many"
+    """Of more dofs than joint space takes; others are taken, where there are actuators, too."""
+    model = crowd(44, 3)
+    why = "steps of a scene with 264 dofs do not solve such pairs in joint space"
     with pytest.warns(
-        UserWarning, match=rf"36 pair\(s\) of shapes, such as .*, because {why} \(pairs=\[\.\.\.\] takes"
+        UserWarning, match=rf"946 pair\(s\) of shapes, such as .*, because {why} \(pairs=\[\.\.\.\] takes"
     ):
         scene = spo.from_mujoco(model, contacts=True)
-    assert not scene.contact_pairs and len(scene.contact_points) == 9
-    with pytest.raises(spo.UnsupportedError, match=rf"pairs='all' of 36 pairs of shapes, more than 32 \({why}\)"):
+    assert not scene.contact_pairs and len(scene.contact_points) == 44
+    with pytest.raises(spo.UnsupportedError, match=rf"contact of 946 pairs of shapes, more than 32 \({why}\)"):
         quiet(spo.from_mujoco, model, contacts="ground", pairs="all")
-    scene = spo.from_mujoco(mujoco.MjModel.from_xml_string(CROWD.format(3)), contacts=True)
+    cans = crowd(44, 3, 'type="cylinder" size=".1 .1"')
+    with pytest.raises(spo.UnsupportedError, match=rf"contact of 1 pairs of .*cylinders or ellipsoids \({why}\)"):
+        quiet(spo.from_mujoco, cans, contacts="ground", pairs=[("g0", "g1")])
+    scene = spo.from_mujoco(crowd(9, 3), contacts=True)
     assert (len(scene.contact_pairs), len(scene.contact_points)) == (36, 9)
     scene = quiet(spo.load, shipped("ant"), contacts=True)
     assert (len(scene.contact_pairs), len(scene.contact_points), len(scene.actuators)) == (44, 25, 8)
+
+
+@pytest.mark.parametrize("count, shape", [(9, 'size=".1"'), (2, 'type="cylinder" size=".1 .1"')])
+@pytest.mark.parametrize("asked", [{}, {"pairs": "all"}, {"pairs": [("g0", "g1")]}])
+def test_friction_against_turning_gives_way_to_pairs(count, shape, asked):
+    """On the ground, where no step takes both; a warning says so. Few spheres keep it."""
+    listed = "pairs" in asked and asked["pairs"] != "all"
+    keeps = listed and count == 9  # one pair of spheres
+    model, wanted = crowd(count, 4, shape), 1 if listed else count * (count - 1) // 2
+    with pytest.warns(UserWarning) as found:
+        scene = spo.from_mujoco(model, contacts=True, **asked)
+    words = "".join(str(each.message) for each in found)
+    assert len(scene.contact_pairs) == wanted and len(scene.contact_points) >= count
+    assert ("torsional friction of the ground, with which no step takes these pairs" in words) != keeps
+    assert any(one.torsional_friction for one in scene.contacts) == keeps
 
 
 def test_contacts_true_of_a_model_and_a_urdf_have_their_pairs(tmp_path):

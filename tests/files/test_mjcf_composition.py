@@ -102,4 +102,4 @@ def test_composed_files_are_mujocos(text, tmp_path):
     (tmp_path / "tool.xml").write_text(TOOL)
     model = mujoco.MjModel.from_xml_path(str(file))
     wrong, said = misreadings(file, model)
-    assert wrong == [] and "contacts between bodies" in said
+    assert wrong == [] and "contacts of" in said

@@ -175,7 +175,10 @@ def test_empty_files_and_texts_of_nothing(suffix, tmp_path):
     [
         ({"floating": "yes"}, "load: floating is 'yes'; expected None, True or False"),
         ({"repair": "no"}, "load: repair is 'no'; expected True or False"),
-        ({"contacts": False}, "load: .*cartpole.urdf': contacts is False; expected True, .*; None, for no contacts"),
+        (
+            {"contacts": False},
+            "load: .*cartpole.urdf': contacts is False; expected 'ground', True, .*; None, for no contacts",
+        ),
         ({"contacts": True, "ground": 3}, "load: .*cartpole.urdf': .*ground is of type int; expected spo.Plane"),
     ],
 )

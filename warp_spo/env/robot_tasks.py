@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import shown
+from ..scene.collision_shapes import floating_bases, moving_trees
 from ..scene.parts import UNLIMITED
 
 WIDTH = 114  # of lines of the file
@@ -41,12 +42,14 @@ def robot_task(file: Path, robot: Path) -> str:
         warnings.simplefilter("ignore")  # which the task says when it is trained
         scene = load(robot, contacts="ground")
     reads = 'contacts="ground"' if scene.contacts else ""
-    if len({_root(scene, hinge.child) for hinge in scene.hinges if hinge.dof_count}) > 1:
+    trees = moving_trees(scene)
+    if len(trees) > 1:
         reads = "contacts=True"  # a robot and what it handles: bodies touch each other, too
     single = [i for i, hinge in enumerate(scene.hinges) if hinge.coord_count == hinge.dof_count == 1]
     if not single:
         raise ValueError(f"--robot {str(robot)!r}: has no joint of one coordinate; expected one or more to act on")
-    floats = any(hinge.kind == "free" and hinge.parent == -1 for hinge in scene.hinges)
+    bases = floating_bases(scene)
+    floats = bool(bases) and len(trees[scene.hinges[bases[0]].child]) > 1  # a free body alone is an object
     if floats and not reads:
         reads = 'contacts="*"'  # of a file without a floor: all shapes, on the plane z = 0
     endless = _endless(scene, single)
@@ -97,18 +100,12 @@ ROBOT = {json.dumps(path)}  # from this file's folder; films and pages draw it, 
 LEARNER = Learner(iterations=300, worlds=512, steps=24, hidden=(128, 64))'''
 
 
-def _root(scene: Any, body: int) -> int:
-    """Return the body at the root of a body's tree."""
-    while (parent := scene.tree.parent[body]) >= 0:
-        body = parent
-    return body
-
-
 def _start(scene: Any, start: np.ndarray) -> str:
     if scene.keyframes:
         names = list(map(json.dumps, scene.keyframes))
         return f"# Where episodes start: the name of a keyframe of the file, {', '.join(names)}.\nSTART = {names[0]}"
-    order = "x, y, z, quaternion xyzw, joints" if scene.hinges[0].coord_count == 7 else "in the order of q"
+    alone = scene.hinges[0].coord_count == 7 and len(moving_trees(scene)) == 1
+    order = "x, y, z, quaternion xyzw, joints" if alone else "in the order of q"
     lines = textwrap.wrap(", ".join(map(_text, start)), WIDTH - 4)
     text = lines[0] if len(lines) == 1 else "\n    " + "\n    ".join(lines) + "\n"
     return f"# Where episodes start, and the file stands: {order}.\nSTART = [{text}]"
@@ -130,12 +127,22 @@ def _action(scene: Any) -> tuple[str, str]:
         return "actions.Effort(scale=1.0, clip=(-1.0, 1.0))", "forces of joints [N m or N]: the file has no actuators"
     servos = [each.gain > 0.0 and each.bias[1] == -each.gain and len(each.hinges) == 1 for each in scene.actuators]
     if all(servos):
-        return 'actions.Control(scale=0.3, offset="default")', "targets of the file's servos, about START [rad or m]"
+        scale = np.array([_stroke(scene, each.hinges[0]) for each in scene.actuators])
+        text = f'actions.Control(scale={_number(scale)}, offset="default")'
+        return text, "targets of the file's servos, about START [rad or m]"
     ranges = np.array([each.ctrl_range for each in scene.actuators])
     ranges = np.where(np.isfinite(ranges).all(axis=1, keepdims=True), ranges, (-1.0, 1.0))
     middle, half = ranges.mean(axis=1), 0.5 * np.ptp(ranges, axis=1)
     given = [f"{name}={_number(each)}" for name, each in (("scale", half), ("offset", middle)) if each.any()]
     return f"actions.Control({', '.join([*given, 'clip=(-1.0, 1.0)'])})", "controls of the file's actuators"
+
+
+def _stroke(scene: Any, hinge: int) -> float:
+    """Return how far an action of one moves the target of a joint: half the range of a slide, at most 0.3."""
+    dof = scene.qd_start[hinge]
+    low, high = (float(scene.values[f"joint_limit_{end}"][0, dof]) for end in ("lower", "upper"))
+    slides = scene.hinges[hinge].kind == "prismatic" and high - low < UNLIMITED
+    return min(0.3, 0.5 * (high - low)) if slides and high > low else 0.3
 
 
 def _number(values: np.ndarray) -> str:
@@ -145,6 +152,19 @@ def _number(values: np.ndarray) -> str:
 
 def _text(x: float) -> str:
     return repr(float(f"{x:.6g}"))
+
+
+def _spreads(scene: Any, single: list[int], limited: list[str]) -> list[str]:
+    """Return the events that change where joints start: by 0.05 rad or m, or less in a short slide."""
+    names: dict[float, list[str]] = {}
+    for i in single:
+        if scene.joint_labels[i] in limited:
+            names.setdefault(round(min(0.05, _stroke(scene, i) / 6.0), 4), []).append(scene.joint_labels[i])
+    every = len(names) == 1 and len(limited) == len(single)
+    return [
+        f"events.joints(position=({-most:g}, {most:g}){'' if every else f', names={_names(each)}'})"
+        for most, each in names.items()
+    ]
 
 
 def _build(scene: Any, single: list[int], endless: list[str], floats: bool, reads: str) -> str:
@@ -157,8 +177,7 @@ def _build(scene: Any, single: list[int], endless: list[str], floats: bool, read
     seen += [] if floats or not endless else ["angles"]  # the angle of a wheel says nothing
     seen += ["Observation(observations.joint_velocity(), scale=0.1)", "observations.last_action"]
     seen += ["observations.command"] if floats else []
-    spread = f"events.joints(position=(-0.05, 0.05){f', names={_names(limited)}' if endless else ''})"
-    changes = [spread] if limited else []
+    changes = _spreads(scene, single, limited)
     if floats:
         goal = """\
             "alive": (1.0, rewards.alive),

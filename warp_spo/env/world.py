@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import shown
 from ..recursions.contact.ground import GroundOffset, height
 from ..recursions.step.joint_laws import DEFAULT_BOUND
+from ..scene.collision_shapes import floating_bases
 from ..trace import spatial
 from ..trace.functions import AbstractScalar, clip, where
 from ..trace.scalars import floor, lookup
@@ -213,10 +214,13 @@ class World:
     # -- base ------------------------------------------------------------------------------------------------------
     @property
     def base(self) -> int:
-        """Index of the free hinge that carries the robot on the inertial frame."""
-        for index, hinge in enumerate(self.scene.hinges):
-            if hinge.kind == "free" and hinge.parent == -1:
-                return index
+        """Index of the free hinge that carries the robot on the inertial frame.
+
+        It is the first one whose tree has further joints; of free bodies without joints, such as objects, the first.
+        """
+        found = floating_bases(self.scene)
+        if found:
+            return found[0]
         raise ValueError("Env: a term reads the base, and no hinge of the scene is free on the inertial frame")
 
     @property

@@ -103,7 +103,7 @@ def lacking(scene: Scene, variable: tuple[str, ...]) -> str:
 def why_few_pairs(scene: Scene) -> str:
     """Return why steps of a scene take only few pairs, whose code is generated; "" if joint space takes many."""
     lacks = lacking(scene, ())
-    return f"steps of a scene with {lacks} do not solve so many" if lacks else ""
+    return f"steps of a scene with {lacks} do not solve such pairs in joint space" if lacks else ""
 
 
 def motor_laws(scene: Scene, variable: tuple[str, ...]) -> tuple[int, ...]:

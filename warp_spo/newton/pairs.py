@@ -14,7 +14,7 @@ from ..errors import UnsupportedError
 from ..execution.joint_tables import why_few_pairs
 from ..kernels import declare
 from ..kernels import newton_contacts as kernels
-from ..scene.collision_shapes import ShapeSelection
+from ..scene.collision_shapes import ALL, ShapeSelection
 from ..scene.contact_checks import unsaid_softness
 from ..scene.contact_values import TURNING_VALUES
 from ..scene.ground import GROUND_VALUES
@@ -40,8 +40,10 @@ def find_pairs(model: newton.Model, worlds: WorldRows, scene: Scene, asked: Any,
     if lacking:
         raise UnsupportedError("SolverSPO", f"pairs={asked!r} with {lacking}", "leave out one of them")
     shapes = ModelShapes(model, worlds)
-    selection = select_pairs("SolverSPO", shapes, scene)
+    selection = select_pairs("SolverSPO", shapes, scene, why_few=why_few_pairs)
     pairs, left_out = selection.resolve(asked)
+    if why := selection.reason_against(scene, pairs, listed=asked != ALL):
+        selection.refuse_many(pairs, why)
     if left_out:
         more = f" and {len(left_out) - 4} more" if len(left_out) > 4 else ""
         warnings.warn(
@@ -104,6 +106,8 @@ def with_model_contacts(model: newton.Model, worlds: WorldRows, scene: Scene, se
     touching, lost = selection.body_pairs(between)
     found, left_out = touched(ModelPairs(shapes(), touching, between()) if touching else None)
     if touching:
+        found, turning = selection.solvable(between(), found, touching)
+        left_out = left_out + turning
         why = selection.refuse_many(between(), found, touching)
         if why:
             (found, left_out), lost = touched(None), between().missed(why)

@@ -138,7 +138,7 @@ class SolverSPO(MassMatrixInterface, SolverBase):
     Raises:
         UnsupportedError: :func:`warp_spo.from_newton` cannot represent the model; mimic joints with loops="raise"; a
             loop joint with forces of its own; particles; position limits on BALL, FREE or DISTANCE joints; pairs that
-            no contact represents, or more than 32 with pairs="all".
+            no contact represents, or which no step takes together.
         ValueError: A name or option is unknown, or there are loop joints with loops="raise", or ``pairs`` holds a name
             of no shape, or two that may not touch.
     """

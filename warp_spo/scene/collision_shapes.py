@@ -194,6 +194,8 @@ class ShapeSelection(NamedTuple):
             touching, lost = self.body_pairs(between)
             made, words = touched(touching)
             if touching and between is not None:
+                made, turning = self.solvable(between(), made, touching)
+                words = words + turning
                 why = self.refuse_many(between(), made, touching)
                 if why:
                     made, words = touched([])
@@ -243,13 +245,31 @@ class ShapeSelection(NamedTuple):
             else selection.chosen(self.pairs)
         )
 
+    def solvable(self, selection: PairSelection, made: Scene, pairs: list[ShapePair]) -> tuple[Scene, list[str]]:
+        """Return the scene without friction against turning on the ground if steps take its pairs then alone.
+
+        The second value says in words what is left out.
+        """
+        if not selection.reason_against(made, pairs):
+            return made, []
+        names = [name for name in FRICTIONS[1:] if any(getattr(one, name) for one in made.contacts)]
+        none: dict[str, Any] = dict.fromkeys(names, 0.0)
+        plain = [dataclasses.replace(one, **none) for one in made.contacts]
+        without = made.with_contacts(plain, made.ground)
+        if not names or selection.reason_against(without, pairs):
+            return made, []
+        friction = " and ".join(name.replace("_", " ") for name in names)
+        way = "contacts='ground' or a pattern keeps it, without pairs; condim=\"3\" of MJCF says that there is none"
+        return without, [f"{friction} of the ground, with which no step takes these pairs of bodies ({way})"]
+
     def refuse_many(self, selection: PairSelection, made: Scene, pairs: list[ShapePair]) -> str:
-        """Return why no step takes a scene with so many pairs that nobody asked for; "" if one does, or for a list.
+        """Return why no step takes a scene with such pairs, which nobody asked for; "" if one does.
 
         Raises:
-            UnsupportedError: the caller asked for all, and no step takes them.
+            UnsupportedError: the caller asked for all, or for some that no step takes.
         """
-        why = selection.reason_against(made, pairs) if self.pairs is None or self._takes_all_pairs else ""
+        listed = self.pairs is not None and not self._takes_all_pairs
+        why = selection.reason_against(made, pairs, listed)
         if why and self.pairs is not None:
             selection.refuse_many(pairs, why)
         return why
@@ -354,6 +374,22 @@ def moving_bodies(scene: Scene) -> np.ndarray:
         parent = scene.tree.parent[body]
         moving[body] = scene.hinges[scene.hinge_of[body]].dof_count > 0 or (parent >= 0 and moving[parent])
     return moving
+
+
+def moving_trees(scene: Scene) -> dict[int, list[int]]:
+    """Return the hinges that move of each tree, by its root; trees that stand still have none and are left out."""
+    found: dict[int, list[int]] = {}
+    for index, hinge in enumerate(scene.hinges):
+        if hinge.dof_count:
+            found.setdefault(scene.tree.root(hinge.child), []).append(index)
+    return found
+
+
+def floating_bases(scene: Scene) -> list[int]:
+    """Return the free hinges on the inertial frame, those of trees with further joints before free bodies alone."""
+    trees = moving_trees(scene)
+    free = [i for i, hinge in enumerate(scene.hinges) if hinge.kind == "free" and hinge.parent == -1]
+    return sorted(free, key=lambda index: len(trees[scene.hinges[index].child]) == 1)
 
 
 # -- contacts ----------------------------------------------------------------------------------------------------------

@@ -143,10 +143,11 @@ class PairSelection:
         sides = (pair for one, other in combinations(trees.values(), 2) for pair in product(one, other))
         return next((ShapePair(*pair) for pair in sides if self.allowed(*pair)), None)
 
-    def reason_against(self, scene: Scene, pairs: Sequence[ShapePair]) -> str:
-        """Return why steps do not take a scene with so many pairs; "" if they do."""
+    def reason_against(self, scene: Scene, pairs: Sequence[ShapePair], listed: bool = False) -> str:
+        """Return why steps do not take a scene with such pairs, or so many that are not ``listed``; "" if they do."""
         curved = any(shape.kind in CURVED for pair in pairs for shape in pair)
-        return self.why_few(scene) if self.why_few is not None and (curved or len(pairs) > MOST) else ""
+        many = len(pairs) > MOST and not listed
+        return self.why_few(scene) if self.why_few is not None and (curved or many) else ""
 
     def missed(self, why: str = "") -> list[str]:
         """Return in words that the scene has no contacts of bodies which may touch each other; nothing without any."""
@@ -204,10 +205,12 @@ class PairSelection:
 
     def refuse_many(self, pairs: Sequence[ShapePair], why: str = "") -> NoReturn:
         """Raise UnsupportedError for more pairs than steps take."""
+        many = f", more than {MOST}" if len(pairs) > MOST else ", some of cylinders or ellipsoids"
         raise UnsupportedError(
             self.call,
-            f"pairs='all' of {len(pairs)} pairs of shapes, more than {MOST}{f' ({why})' if why else ''}",
-            "list those that matter, such as pairs=[('cube', '*finger*')], or filter others in the model",
+            f"contact of {len(pairs)} pairs of shapes{many}{f' ({why})' if why else ''}",
+            "list those that matter, such as pairs=[('cube', '*finger*')], or filter others in the model; "
+            "capsules, boxes and hulls need no joint space",
         )
 
     def _representable(self) -> tuple[list[ShapePair], list[str]]:

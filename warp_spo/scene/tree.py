@@ -257,6 +257,12 @@ class Tree:
             segments.append(tuple(chain))
         return tuple(segments)
 
+    def root(self, i: int) -> int:
+        """Return the root of the tree that holds node i."""
+        while (parent := self.parent[i]) >= 0:
+            i = parent
+        return i
+
     def is_ancestor(self, i: int, j: int) -> bool:
         """Return whether a path leads from node i to node j; False for i = j."""
         i, j = (_index("Tree.is_ancestor", "a node", k, 0, self.node_count) for k in (i, j))

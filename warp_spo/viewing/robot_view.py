@@ -12,6 +12,7 @@ import numpy as np
 
 from ..dynamics.dynamics import Dynamics
 from ..errors import shown
+from ..scene.collision_shapes import moving_trees
 from ..scene.ground import Plane
 from ..scene.scene import Scene
 from ..status import Status
@@ -313,15 +314,16 @@ class RobotView:
         self.page.close()
 
 
-def view(robot: Any, host: str = HOST, port: int = PORT, contacts: Any = "ground", **options: Any) -> RobotView:
+def view(robot: Any, host: str = HOST, port: int = PORT, contacts: Any = None, **options: Any) -> RobotView:
     """Return the page of a robot, whose address is its ``page.url``; Jupyter shows it inline, ``run()`` serves it.
 
     Args:
         robot: a :class:`warp_spo.Scene`, a ``newton.Model``, or the path of a URDF, MJCF or USD file.
         host: address to listen on; others than this machine can steer only if it is not 127.0.0.1. port: the first to
             try; the next free one is taken.
-        contacts: of a file or a model: which shapes touch the ground, see :func:`warp_spo.load`. Where a file says no
-            ground, it is the plane z = 0.
+        contacts: of a file or a model: which shapes touch, see :func:`warp_spo.load`. None: those of all bodies touch
+            the ground, and each other if more than one tree moves, as a robot and what it handles do. Where a file says
+            no ground, it is the plane z = 0.
         options: further arguments of :func:`warp_spo.load`.
 
     Raises:
@@ -341,7 +343,9 @@ def view(robot: Any, host: str = HOST, port: int = PORT, contacts: Any = "ground
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        scene = from_newton(robot, contacts=contacts)
+        scene = from_newton(robot, contacts="ground" if contacts is None else contacts)
+        if contacts is None and len(moving_trees(scene)) > 1:
+            scene = from_newton(robot, contacts=True)
     notes = [str(each.message) for each in caught if issubclass(each.category, UserWarning)]
     return RobotView(scene, model_appearance(robot, scene), "model", notes, host, port)
 
@@ -360,12 +364,16 @@ def load_with_notes(file: Path, contacts: Any, options: dict[str, Any]) -> tuple
         return found
 
     try:
-        scene = read(contacts)
+        scene = read("ground" if contacts is None else contacts)
+        if contacts is None and len(moving_trees(scene)) > 1:
+            scene = read(True)
     except (ValueError, ImportError) as error:  # of a shape; without contacts the file may do
         refusal = str(error)
         scene = read(None)
         return scene, [*notes, f"no contacts: {refusal}"]
-    if scene.contacts or contacts is None or "ground" in options:
+    if contacts is None:
+        contacts = True if len(moving_trees(scene)) > 1 else "ground"
+    if scene.ground is not None or "ground" in options:
         return scene, notes
     try:
         options = options | {"ground": Plane()}
