@@ -142,7 +142,7 @@ def test_limbs_share_rounds_without_contacts(device):
     for granularity in ("tree", "segment"):
         dyn = spo.Dynamics(scene, WORLDS, device, "float64", granularity=granularity)
         found.append(np.hstack(dyn.step(a["q"], a["qd"], a["tau"], H, options=spo.StepOptions(rounds=1))))
-    assert any("segment" in line for line in dyn.programs.described())
+    assert any("segment" in line for line in dyn.programs.describe())
     np.testing.assert_allclose(found[1], found[0], atol=1e-9)
 
 

@@ -6,6 +6,7 @@ import pytest
 import warp_spo as spo
 from support.pair_motions import largest_rise, momentum, stand
 from support.pair_scenes import H, cube, cubes_in_a_row, free, stack, stacked, stepped
+from support.pair_steps import leave_to_generated_code
 from warp_spo.examples import grasp
 from warp_spo.kernels import coupling, straight_line
 from warp_spo.recursions.contact import coupled, pair_pieces
@@ -115,6 +116,7 @@ def test_more_pairs_than_are_solved_together(monkeypatch, device, together):
     """Aggregates solve all; otherwise eight are exact, ten as near as the residual says. Momentum is kept."""
     for module in (coupled, pair_pieces):
         monkeypatch.setattr(module, "is_supported", lambda links: together)
+    leave_to_generated_code(monkeypatch)
     for count, pairs in ((9, 8), (11, 10)):
         scene, q, qd = cubes_in_a_row(count)
         dyn, residual = spo.Dynamics(scene, 2, device=device, dtype="float64"), np.full(2, np.nan)
