@@ -94,7 +94,7 @@ def test_a_new_file_begins_as_a_ready_task(name, tmp_path, capsys):
     assert "from ." not in file.read_text()
     with pytest.raises(SystemExit):
         tasks.main(["--new", str(file)])
-    assert "File exists" in capsys.readouterr().err
+    assert "there is such a file" in capsys.readouterr().err
 
 
 def test_a_file_to_start_from_makes_the_environment(tmp_path):
