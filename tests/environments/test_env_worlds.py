@@ -11,6 +11,7 @@ import warp_spo.env as envs
 from support.env_scenes import FEET, cart_env, cart_scene, walker_env, walker_q, walker_scene
 from warp_spo.env import TorchTerm, actions, commands, evaluation, events, observations, rewards
 from warp_spo.env.tasks import velocity
+from warp_spo.recursions.contact import coupled
 from warp_spo.reference import Dense
 
 FLOAT32 = 1e-6  # a few roundings of numbers of size one
@@ -540,8 +541,19 @@ def test_the_first_gap_of_two_bodies_is_that_of_the_new_state():
     np.testing.assert_allclose(observed["a"][[0, 2], 0].numpy(), find_gap_of_boxes(env.q.numpy())[[0, 2]], atol=FLOAT32)
     env.q[1, 1] = 5.0
     observed, _, ended, _ = env.step(torch.zeros(3, 1))
-    assert torch.isinf(env._tensors["contact_gap"][1]).all() and not ended.any()
+    assert (env._tensors["contact_gap"][1] > 1.0).all() and not ended.any()
     assert observed["a"][1, 0] == 1.0 and (observed["a"][[0, 2], 0] < 0.2).all()
+
+
+@pytest.mark.slow
+def test_a_gap_that_is_infinite_ends_no_world(monkeypatch):
+    """In joint space, where pairs that are not near have no gap."""
+    monkeypatch.setattr(coupled, "is_supported", lambda links: False)
+    env = make_pair_env()
+    env.q[1, 1] = 5.0
+    observed, _, ended, _ = env.step(torch.zeros(3, 1))
+    assert torch.isinf(env._tensors["contact_gap"][1]).all() and not ended.any()
+    assert observed["a"][1, 0] == 1.0
 
 
 def make_pair_env():
