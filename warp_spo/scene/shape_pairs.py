@@ -41,7 +41,7 @@ class ShapePair(NamedTuple):
 
     @property
     def unread(self) -> str:
-        """What of the pair's material a contact of two bodies does not take, in words; "" if there is nothing."""
+        """Parts of the pair's material that a contact of two bodies does not take, in words; "" if there are none."""
         own = self.first.with_mean_material(self.second)
         turning = [name.replace("_", " ") for name in FRICTIONS[1:] if getattr(own, name)]
         return ", ".join([*turning, *([own.unread] if own.unread else [])])

@@ -1,6 +1,6 @@
 """Elements and attributes of a URDF's joints and links that URDF does not define, such as misspelt ones.
 
-They are not read. What other programs write for shapes, and hints that concern no motion, are left alone.
+They are not read. Names of other programs for shapes, and hints that concern no motion, are left alone.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a solver of touching bodies in joint space reads of a state, beside the mass matrix and the bodies' poses.
+"""Values of a state that the solver of touching bodies in joint space reads, beside mass matrix and body poses.
 
 These are the bias force, the surfaces of the ground at the points that may touch it, and what the laws of joints, pairs
 and points have in a world, of values that are variable or differ between worlds. A surface's point moves along a
