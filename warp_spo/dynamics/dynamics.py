@@ -332,7 +332,7 @@ class Dynamics:
 
     @functools.cached_property
     def _joint_space(self) -> JointSpaceStep | None:
-        """The solver of pairs of bodies in joint space; None where there are no pairs, or generated code solves them."""
+        """The solver of pairs of bodies in joint space; None without pairs, or where generated code solves them."""
         return choose_solver(self)
 
     @functools.cached_property
