@@ -293,15 +293,14 @@ def rocks_states(seed, worlds):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("granularity", ["tree", "segment"])
-def test_a_step_with_hulls_is_the_dense_one(device, granularity):
+def test_a_step_with_hulls_is_the_dense_one(device):
     """Hulls on either side, one that stands still; a world does alone what it does among others."""
     (q, qd), scene = rocks_states(0, 6), rocks()
-    dyn = spo.Dynamics(scene, 6, device=device, dtype="float64", granularity=granularity)
+    dyn = spo.Dynamics(scene, 6, device=device, dtype="float64")
     found = assert_is_dense(dyn, q, qd, least=12)
     assert (found["contact_f"][:, len(scene.contact_points) :] != 0.0).any(axis=(0, 2)).all()
     for alone in (0, 5):
-        dyn = spo.Dynamics(scene, 1, device=device, dtype="float64", granularity=granularity)
+        dyn = spo.Dynamics(scene, 1, device=device, dtype="float64")
         one = stepped(dyn, q[alone : alone + 1], qd[alone : alone + 1])
         for key in ("q", "qd", "contact_f"):
             np.testing.assert_array_equal(one[key][0], found[key][alone])

@@ -9,7 +9,7 @@ from support.pair_scenes import H, cube, cubes_in_a_row, free, stack, stacked, s
 from support.pair_steps import leave_to_generated_code
 from warp_spo.examples import grasp
 from warp_spo.kernels import coupling, straight_line
-from warp_spo.recursions.contact import coupled, pair_pieces
+from warp_spo.recursions.contact import coupled
 from warp_spo.reference.body_contact import PairStep
 
 
@@ -114,8 +114,7 @@ def test_a_heavy_cube_on_light_ones(device):
 @pytest.mark.parametrize("together", [True, False])
 def test_more_pairs_than_are_solved_together(monkeypatch, device, together):
     """Aggregates solve all; otherwise eight are exact, ten as near as the residual says. Momentum is kept."""
-    for module in (coupled, pair_pieces):
-        monkeypatch.setattr(module, "is_supported", lambda links: together)
+    monkeypatch.setattr(coupled, "is_supported", lambda links: together)
     leave_to_generated_code(monkeypatch)
     for count, pairs in ((9, 8), (11, 10)):
         scene, q, qd = cubes_in_a_row(count)

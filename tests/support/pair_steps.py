@@ -6,7 +6,7 @@ import textwrap
 import numpy as np
 
 from warp_spo.dynamics.stepping import joint_space
-from warp_spo.recursions.contact import coupled, pair_pieces
+from warp_spo.recursions.contact import coupled
 from warp_spo.reference.body_contact import PairStep
 
 from .pair_scenes import H, stepped
@@ -80,8 +80,6 @@ def leave_to_generated_code(monkeypatch):
 
 
 def respond_by_whole_trees(monkeypatch):
-    """Let kernels find the response to pairs by sweeps over whole trees, as where limbs and aggregates cannot share."""
-    for each in ("is_supported", "by_limbs"):
-        monkeypatch.setattr(pair_pieces, each, lambda scene: False)
+    """Let kernels find the response to pairs by sweeps over whole trees, as where aggregates cannot share."""
     monkeypatch.setattr(coupled, "is_supported", lambda links: False)
     leave_to_generated_code(monkeypatch)

@@ -133,14 +133,13 @@ class Builder:
         given = stores, everything, job.shapes, more, sent, warps, self.run.dtype
         return staging.choose_layout(*given, *ways, self.relays, room, wide)
 
-    def room(self, wide: bool = False, couples: bool = False, whole: bool = False) -> int:
+    def room(self, wide: bool = False, whole: bool = False) -> int:
         """Bytes of shared memory that a block may have: for as many scalars in float64 as in float32 if the GPU can.
 
-        ``wide``: for long rows that all go through it. ``couples``: for what segments couple in it. ``whole``: all that
-        a multiprocessor has.
+        ``wide``: for long rows that all go through it. ``whole``: all that a multiprocessor has.
         """
-        more = straight_line.COUPLED_BYTES if couples else straight_line.WIDE_BYTES if wide else 0
-        wanted = max(straight_line.SHARED_BYTES, more) * wp.types.type_size_in_bytes(self.run.dtype) // 4
+        most = max(straight_line.SHARED_BYTES, straight_line.WIDE_BYTES if wide else 0)
+        wanted = most * wp.types.type_size_in_bytes(self.run.dtype) // 4
         allowed = self.plan.device.shared_bytes - 3 * RESERVED  # Warp takes a share, too
         wanted = max(wanted, allowed) if whole else wanted
         return min(wanted, max(allowed, straight_line.SHARED_BYTES)) if self.plan.device.cuda else wanted

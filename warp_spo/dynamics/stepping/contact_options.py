@@ -9,7 +9,6 @@ import warp as wp
 from ...errors import UnsupportedError, as_integer
 from ...kernels import combination
 from ...recursions.contact import step as contact_step
-from ...recursions.contact.pair_pieces import by_limbs
 from ...recursions.contact.pairs import RESIDUAL, default_passes
 from ...recursions.contact.turning import turning_names
 from ...runtime.arrays import Call
@@ -98,9 +97,6 @@ def refuse(dyn: Dynamics, call: Call, integrator: str) -> None:
         why = reason_against(dyn.scene, dyn.variable) or NO_ROOM
         what = f"cylinders and ellipsoids in contact with other bodies ({why})"
         raise UnsupportedError(call.name, what, "give capsules, boxes or hulls in their place")
-    if forced == "segment" and apart and not by_limbs(dyn.scene):
-        what = "granularity='segment' where pairs of bodies are not all on limbs of one link, or more than eight"
-        raise UnsupportedError(call.name, what, "leave it out")
     if isinstance(dyn.scene.ground, HeightField) and dyn.scene.ground.heights.size >= MOST_HEIGHTS[dyn.dtype.__name__]:
         way = "use dtype='float64', or a coarser field"
         raise UnsupportedError(call.name, f"a HeightField of {dyn.scene.ground.heights.size} points in float32", way)

@@ -17,13 +17,13 @@ from ..model.links import Link, Links
 from ..step.phases import StepPhases
 from . import aggregates
 from .aggregates import LAST, Node, Seat, Seats, Tie, add
-from .pairs import RESIDUAL, place_axes_of, values_of, velocities_of
+from .pairs import RESIDUAL, PairedStep, place_axes_of, values_of, velocities_of
 from .points import TracedContactPoint, with_ancestors
 from .step import ContactStepTrace, PointState
 from .ties import Couple, TiePlan, couples_of, flies, key
 
 if TYPE_CHECKING:
-    pass
+    from ..model.tracing import Trace
 
 PLACE, VALUE, DAMPER = "couple_place", "couple_value", "couple_damper"
 START, TWIST = "couple_start", "couple_twist"
@@ -216,3 +216,9 @@ class CoupledStep(ContactStepTrace):
 
 def _twist_stores(array: str, number: int, twist: Vector) -> list[Store]:
     return [Store(array, (6 * number + i,), value) for i, value in enumerate((*twist[3:], *twist[:3]))]
+
+
+def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> StepPhases:
+    """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world; and the ``reports``"""
+    form = CoupledStep if is_supported(trace.links) else PairedStep
+    return form(trace, reports).stores(qdd, status)

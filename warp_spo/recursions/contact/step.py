@@ -85,7 +85,6 @@ class ContactStepTrace(Step):
         phases.add_invariants(value for group in self.cull_groups.values() for value in (group.highest, group.reach))
         terms, tau = self._step_terms(points, states), trace.vector("tau")
         done, rates, sent = self.inward(terms, lambda dof: tau(dof) + self.forces[dof] - bias[dof])
-        rates = self.close(done, rates)
         alpha: dict[int, Twist] = {}
         moved = self.outward(done, rates, alpha)
         gains = {item.index[0]: self.h * item.value for item in moved if item.array == "out"}
@@ -159,10 +158,6 @@ class ContactStepTrace(Step):
         return expand(self.trace, done, rates, (ZERO, ZERO), alpha=alpha)
 
     # -- bodies that touch each other ------------------------------------------------------------------------------
-    def close(self, done: dict, rates: dict) -> dict:
-        """Return the rates of a segment, by link, with what forces between its bodies and others add."""
-        return rates
-
     def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, Twist]) -> dict[int, Value]:
         """Return qd' - qd by dof with the forces between bodies; ``alpha`` becomes that of the links."""
         return gains
@@ -177,10 +172,6 @@ class ContactStepTrace(Step):
     def last_excess(self) -> tuple[list[Value], ...]:
         """Return the same of the last pass where no pass knows it: cones, pulls, efforts, missing pushes."""
         return [], [], [], []
-
-    def reported(self) -> list[Store]:
-        """Return the stores of reports on bodies that touch each other that follow after all segments are done."""
-        return []
 
     # -- hinges ----------------------------------------------------------------------------------------------------
     def _active_pieces(self, link: Link) -> list[Law]:
@@ -356,11 +347,10 @@ class ContactStepTrace(Step):
             phases.add_final_messages(exchange.send("E", exchange.own_segments[0], self.excess))
             if exchange.is_first:
                 sent_by = zip(*(exchange.receive("E", piece) for piece in exchange.segments), strict=True)
-                kinds = ((*values, *more) for values, more in zip(sent_by, self.last_excess(), strict=True))
-                self.excess = [largest(list(values)) for values in kinds]
+                self.excess = [largest(list(values)) for values in sent_by]
         sent, word = self._send_status(results) if status else ([], [])
         phases.add_final_messages(sent)
-        last = [*self._excess_stores(), *self.reported(), *word] if exchange.is_first else []
+        last = [*self._excess_stores(), *word] if exchange.is_first else []
         if last:
             phases.add_final_stores(last)
 
