@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 import warp_spo as spo
 from support.hull_scenes import CAN, CUBE, LAW, TETRAHEDRON
 from support.pair_scenes import WEDGE, cube, free, stepped
-from support.pair_steps import assert_is_dense, respond_by_whole_trees
+from support.pair_steps import assert_is_dense
 from support.pair_touches import hull_of, planted, touches_found
 from warp_spo.kernels import hull_distance
 from warp_spo.reference import body_contact
@@ -304,10 +304,3 @@ def test_a_step_with_hulls_is_the_dense_one(device):
         one = stepped(dyn, q[alone : alone + 1], qd[alone : alone + 1])
         for key in ("q", "qd", "contact_f"):
             np.testing.assert_array_equal(one[key][0], found[key][alone])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_the_response_of_whole_trees_takes_hulls(monkeypatch, device, dtype):
-    respond_by_whole_trees(monkeypatch)
-    assert_is_dense(spo.Dynamics(rocks(), 6, device=device, dtype=dtype), *rocks_states(1, 6), least=12)

@@ -27,13 +27,13 @@ from support.pair_scenes import (
     stack,
     stepped,
 )
-from support.pair_steps import assert_is_dense, plant, respond_by_whole_trees
+from support.pair_steps import assert_is_dense, plant
 from support.pair_touches import assert_points_are_those_of_the_reference
 from warp_spo.dynamics.stepping.integrators import CONTACT_STEP, PAIRED_STEP
 from warp_spo.examples import grasp
 from warp_spo.execution import plan
 from warp_spo.execution.device_facts import MEASURED
-from warp_spo.kernels import couples, coupling_points
+from warp_spo.kernels import couple_laws, couples
 from warp_spo.recursions.contact import aggregates, coupled
 
 WORLDS = 9
@@ -78,15 +78,6 @@ def test_a_world_does_the_same_alone(device, name):
     one = stepped(alone, q[-1:], qd[-1:])
     for key in ("q", "qd", "contact_f"):
         np.testing.assert_array_equal(one[key][0], found[key][-1])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["hand", "mixed"])
-def test_the_response_of_whole_trees_does_the_same(monkeypatch, device, name):
-    """Scenes take it whose links share dofs, or whose aggregates would be too long."""
-    respond_by_whole_trees(monkeypatch)
-    scene, states = {"hand": (hand, hand_states), "mixed": (mixed, mixed_states)}[name]
-    assert_is_dense(spo.Dynamics(scene(), 6, device=device, dtype="float64"), *states(1, 6))
 
 
 @pytest.mark.slow
@@ -139,8 +130,8 @@ def test_nan_stays_in_its_world(device):
 
 FIND = "counts[pair] = find(pair, places, touches);"
 BUGS = {
-    "adhesion": (coupling_points, "touch.depth - h * normal > 0;", "true;"),
-    "opens at last": (coupling_points, "(closing && closed) || ", ""),
+    "adhesion": (couple_laws, "touch.depth - h * normal > 0;", "true;"),
+    "opens at last": (couple_laws, "(closing && closed) || ", ""),
     "no friction": (couples, "sides.add(a, touch.at);", ""),
     "no lever of friction": (couples, "skew[3 * i + j - 3]", "0"),
     "no lever of springs": (couples, "add_cross(load, push + 1, normal);", ""),

@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from ..kernels import coupling, native, straight_line
+from ..kernels import native, straight_line
 from ..kernels.fields import axes
 from ..kernels.native import INTEGERS
 from ..kernels.straight_line import BY_TABLE, TILED, KernelLayout
-from ..recursions.contact import coupled, pairs
+from ..recursions.contact import coupled
 from ..recursions.contact.ground import GROUND
 from ..recursions.contact.secant_laws import SECANT
 from ..recursions.model.flexible import attach
@@ -149,11 +149,6 @@ class Builder:
         ground = self.run.scene.ground
         return {GROUND: self.run.parameters.ground_cells} if reads and isinstance(ground, HeightField) else {}
 
-    def touch_tables(self, points: tuple[int, ...]) -> dict[str, Any]:
-        """Return the array of touches, for so many points of each pair of bodies."""
-        shape = coupling.entries(points)[-1], coupling.columns(self.run.worlds)
-        return {"touches": self.run.array("touches", *shape)}
-
     def finish(
         self,
         routine: Routine,
@@ -210,6 +205,6 @@ class Builder:
 
 def flatten(item: Store, shapes: dict[str, tuple[int, ...]]) -> Store:
     """Return a store with one index; entries of a kernel's own arrays have one already."""
-    if item.array in (INWARD, OUTWARD, *PASSED, *pairs.READ, *coupled.ARRAYS):
+    if item.array in (INWARD, OUTWARD, *PASSED, *coupled.ARRAYS):
         return item
     return item._replace(index=(staging.flat_index(item.index, shapes[item.array][1:]),))

@@ -17,7 +17,7 @@ from ..model.links import Link, Links
 from ..step.phases import StepPhases
 from . import aggregates
 from .aggregates import LAST, Node, Seat, Seats, Tie, add
-from .pairs import RESIDUAL, PairedStep, place_axes_of, values_of, velocities_of
+from .pairs import RESIDUAL, place_axes_of, values_of, velocities_of
 from .points import TracedContactPoint, with_ancestors
 from .step import ContactStepTrace, PointState
 from .ties import Couple, TiePlan, couples_of, flies, key
@@ -181,13 +181,12 @@ class CoupledStep(ContactStepTrace):
                 first = PLACES * pair + 12 * side
                 self.first += [Store(PLACE, (first + i,), value) for i, value in enumerate(values)]
 
-    def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, Twist]) -> dict[int, Value]:
+    def after_sweep(self, alpha: dict[int, Twist]) -> None:
         """Leave the relative twists after the pass."""
         for number, couple in enumerate(self.couples):
             self.trace.label(couple.f, f"t{number}_")
             twist = self._twist(number, couple, self.velocities) + self._twist(number, couple, alpha) * self.h
             self.twists += _twist_stores(TWIST, number, twist)
-        return gains
 
     def last_excess(self) -> tuple[list[Value], ...]:
         """Return cone, pull, effort and lacking push of all couples after the last pass."""
@@ -220,5 +219,4 @@ def _twist_stores(array: str, number: int, twist: Vector) -> list[Store]:
 
 def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> StepPhases:
     """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world; and the ``reports``"""
-    form = CoupledStep if is_supported(trace.links) else PairedStep
-    return form(trace, reports).stores(qdd, status)
+    return CoupledStep(trace, reports).stores(qdd, status)

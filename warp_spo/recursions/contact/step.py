@@ -88,7 +88,7 @@ class ContactStepTrace(Step):
         alpha: dict[int, Twist] = {}
         moved = self.outward(done, rates, alpha)
         gains = {item.index[0]: self.h * item.value for item in moved if item.array == "out"}
-        gains = self.couple(done, gains, alpha)
+        self.after_sweep(alpha)
         passed = [item for item in moved if item.array != "out"]
         passed += [Store(GAIN, (trace.exchange.place_of(dof),), gain) for dof, gain in gains.items()]
         efforts = []
@@ -99,7 +99,7 @@ class ContactStepTrace(Step):
                 for dof in link.dofs
                 for law in self.secant_laws[dof]
             ]
-        excess = self.coupled_excess()
+        excess: tuple[list[Value], ...] = [], [], []
         forces = self._forces(points, states, alpha, excess)
         for number, surfaces in forces.items():
             self._report(number, surfaces)
@@ -158,19 +158,11 @@ class ContactStepTrace(Step):
         return expand(self.trace, done, rates, (ZERO, ZERO), alpha=alpha)
 
     # -- bodies that touch each other ------------------------------------------------------------------------------
-    def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, Twist]) -> dict[int, Value]:
-        """Return qd' - qd by dof with the forces between bodies; ``alpha`` becomes that of the links."""
-        return gains
-
-    def coupled_excess(self) -> tuple[list[Value], list[Value], list[Value]]:
-        """Return by how much forces between bodies leave their cones, how much they pull, and pushes that are missing.
-
-        Those of points with the ground are added.
-        """
-        return [], [], []
+    def after_sweep(self, alpha: dict[int, Twist]) -> None:
+        """Keep what bodies that touch each other read of the accelerations of links by id after a pass."""
 
     def last_excess(self) -> tuple[list[Value], ...]:
-        """Return the same of the last pass where no pass knows it: cones, pulls, efforts, missing pushes."""
+        """Return by how much bodies that touch each other leave their laws: cones, pulls, efforts, missing pushes."""
         return [], [], [], []
 
     # -- hinges ----------------------------------------------------------------------------------------------------
