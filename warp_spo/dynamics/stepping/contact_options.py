@@ -9,7 +9,7 @@ import warp as wp
 from ...errors import UnsupportedError, as_integer
 from ...kernels import combination
 from ...recursions.contact import step as contact_step
-from ...recursions.contact.pairs import RESIDUAL, default_passes
+from ...recursions.contact.pairs import default_passes
 from ...recursions.contact.turning import turning_names
 from ...runtime.arrays import Call
 from ...scene.contact_values import contact_figures
@@ -22,8 +22,8 @@ from .joint_space import reason_against
 if TYPE_CHECKING:
     from ..dynamics import Dynamics
 
-REPORTS = (*contact_step.REPORTS, RESIDUAL)
-AXES = ("world, contact, 3", "world, contact", "world, contact", "world, 3", "world, contact, 3", "world")
+REPORTS = contact_step.REPORTS
+AXES = ("world, contact, 3", "world, contact", "world, contact", "world, 3", "world, contact, 3")
 ARGUMENTS = tuple(
     Argument(name, axes, optional=True, asked=True, written=True) for name, axes in zip(REPORTS, AXES, strict=True)
 )
@@ -42,10 +42,6 @@ def check_step(dyn: Dynamics, call: Call, integrator: str, passes: Any, asked: d
             if value is not None:
                 raise ValueError(f"{call.name}: {name} is given, and the scene has no contacts; expected None")
         return None
-    if asked[RESIDUAL] is not None and not dyn.scene.contact_pairs:
-        raise ValueError(
-            f"{call.name}: {RESIDUAL} is given, and no bodies of the scene touch each other; expected None"
-        )
     if asked["contact_moment"] is not None and not turns(dyn):
         raise ValueError(
             f"{call.name}: contact_moment is given, and no contact has torsional or rolling friction; expected None"

@@ -12,7 +12,7 @@ from ...execution.joint_tables import joint_tables, lacking, motor_laws, way_out
 from ...execution.routine import Routine
 from ...kernels import convex_pairs, joint_space, near_pairs
 from ...recursions.contact import coupled, joint_system
-from ...recursions.contact.pairs import PASSES, RESIDUAL
+from ...recursions.contact.pairs import PASSES
 from ...recursions.contact.points import surface_numbers
 from ...recursions.contact.step import TOLERANCE
 from ...runtime import launches
@@ -290,9 +290,8 @@ class JointSpaceStep:
         ctrl: wp.array | None = None,
     ) -> None:
         """Launch the step of :meth:`Dynamics.step`; ``after``: arrays for q and qd, ``reports``: others by name."""
-        for name in (RESIDUAL, "contact_moment"):
-            if name in reports:
-                launches.fill(reports[name], 0)
+        if "contact_moment" in reports:
+            launches.fill(reports["contact_moment"], 0)
         renamed = {"contact_excess": "excess"}
         results = {renamed.get(name, name): array for name, array in reports.items()}
         self.step(q, qd, tau, (target_q, target_qd), dt, passes, after, body_f, ctrl, results)

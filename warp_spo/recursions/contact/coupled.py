@@ -17,7 +17,7 @@ from ..model.links import Link, Links
 from ..step.phases import StepPhases
 from . import aggregates
 from .aggregates import LAST, Node, Seat, Seats, Tie, add
-from .pairs import RESIDUAL, place_axes_of, values_of, velocities_of
+from .pairs import place_axes_of, values_of, velocities_of
 from .points import TracedContactPoint, with_ancestors
 from .step import ContactStepTrace, PointState
 from .ties import Couple, TiePlan, couples_of, flies, key
@@ -199,7 +199,7 @@ class CoupledStep(ContactStepTrace):
         """Return the stores of what couples report, after the rows of the points."""
         first, offset = len(self.trace.links.scene.contact_points), {"contact_gap": 3, "contact_slip": 4}
         read = lambda i: self.trace.graph.input(REPORT, i)  # noqa: E731
-        stores = [Store(name, (), 0.0)] if name == RESIDUAL else []
+        stores: list[Store] = []
         for number, couple in enumerate(self.couples):
             axes = self.plan.by_couple[number].base if couple.ties else couple.f
             for pair, sign in zip(couple.pairs, couple.signs, strict=True):
