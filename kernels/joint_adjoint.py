@@ -34,12 +34,13 @@ ARGUMENTS = [
     *SOLVED[:READ], ("cotangent", 2),
     ("work", 2), ("solved", 2), ("gains", 2), ("tau_bar", 2), ("q_bar", 2), ("qd_bar", 2), ("target_q_bar", 2),
     ("target_qd_bar", 2), ("screws_bar", 2), ("touches_bar", 2), ("surfaces_bar", 2), ("motors_bar", 2),
-    ("pair_bar", 2),
+    ("stiffness_bar", 2), ("damping_bar", 2), ("friction_bar", 2),
 ]  # fmt: skip
 """Names and numbers of axes: what a step reads, the gradient by its rates [world, dof], memory of :func:`work_size`.
 
 ``solved``, ``gains`` [world, pass * dof]: -h lambda, and x / h. The others are gradients; those by ``q`` and targets are
-the part that the laws of the joints have, that by ``qd`` all but what bias force and surfaces have.
+the part that the laws of the joints have, that by ``qd`` all but what bias force and surfaces have. By the values of
+contacts [world, contact] they are whole for pairs, and lack what push and damping of surfaces have.
 """
 
 BEFORE = r"""
@@ -376,21 +377,21 @@ EACH (at, slots) {
         to[6] = pair_value[PV * pair + P_STIFFNESS] * share * spring_b[at];
     }
 }
-EACH (pair, PAIRS + SURFACES) {
-    REAL *const to = pair_bar.data + world * pair_bar.shape[1] + PV * pair;
-    for (int c = 0; c < PV; ++c) to[c] = 0;
+EACH (contact, stiffness_bar.shape[1]) {
+    REAL by[3] = {0, 0, 0};
     for (int at = 0; at < slots; ++at) {
-        const int where = slot_of[at];
-        if (joint_space::pair_of(nears, where) != pair) continue;
-        to[P_FRICTION] += mu_b[at];
-        if (pair >= PAIRS) {
-            to[P_STIFFNESS] += h * kd_b[at];
-            continue;
-        }
-        const REAL share = (REAL)1 / nears[1 + NEAR + where / MOST];
-        to[P_STIFFNESS] += share * FMA(slot[DEPTH * S + at], spring_b[at], h * kd_b[at]);
-        to[P_DAMPING] += share * kd_b[at];
+        const int where = slot_of[at], pair = joint_space::pair_of(nears, where);
+        if (table[T_PAIR + 2 * pair + 1] != contact) continue;
+        const bool ground = pair >= PAIRS;
+        const REAL share = ground ? 1 : (REAL)1 / nears[1 + NEAR + where / MOST];
+        by[0] += ground ? h * kd_b[at] : share * FMA(slot[DEPTH * S + at], spring_b[at], h * kd_b[at]);
+        by[1] += ground ? 0 : share * kd_b[at];
+        by[2] += mu_b[at];
     }
+    const long long to = world * stiffness_bar.shape[1] + contact;
+    stiffness_bar.data[to] = by[0];
+    damping_bar.data[to] = by[1];
+    friction_bar.data[to] = by[2];
 }
 SYNC
 // -- gradients by what dofs move

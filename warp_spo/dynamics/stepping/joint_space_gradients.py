@@ -68,7 +68,7 @@ class JointSpaceGradients:
 
         ``given``: arguments of the step, "qdd" that it found, and the cotangents of its results.
         """
-        engine, solver = self.dyn._engine, self.solver
+        solver = self.solver
         given = {name: value for name, value in given.items() if value is not None}
         q, qd, h, count = given["q"], given["qd"], given["dt"], PASSES if passes is None else int(passes)
         acting = {name: given.get(name) for name in ACTING}
@@ -89,7 +89,7 @@ class JointSpaceGradients:
         inputs = {name: value for name, value in acting.items() if value is not None}
         if not solver.tables.sizes.laws:
             inputs = {name: value for name, value in inputs.items() if name == "body_f"}
-        by_system = tuple(name for name in results if name in (*STATES, *inputs))
+        by_system = tuple(name for name in results if name in (*STATES, *inputs, *VALUES))
         systems = {name: self._array("system", name, results[name].shape) for name in by_system}
         options: dict[str, Any] = dict(pairs=tuple(solver.tables.pairs), motors=solver.motor_laws)
         options["surfaces"] = bool(solver.tables.sizes.surfaces)
@@ -98,7 +98,7 @@ class JointSpaceGradients:
         names += (joint_system.OF_MOTORS,) if solver.tables.sizes.laws else ()
         seeds = {f"{name}_bar": found[name] for name in names}
         self._pull(SYSTEM, systems, q=q, qd=qd, dt=h, **inputs, **seeds, **options)
-        for source in (states, {name: found[name] for name in LAWS}, systems):
+        for source in (states, {name: found[name] for name in (*LAWS, *VALUES)}, systems):
             for name in results.keys() & source.keys():
                 sums[name].append(source[name])
         for number in range(count):
@@ -138,10 +138,9 @@ class JointSpaceGradients:
         shapes |= {"screws": solver.screws, "touches": solver.touches, "surfaces": solver.surfaces}
         found = {name: self._array("gradient", name, like.shape) for name, like in shapes.items()}
         found["motors"] = self._array("gradient", "motors", solver.motors.shape)
-        rows = max(1, (sizes.pairs + sizes.surfaces) * len(joint_space.PAIR_VALUES))
-        found["pairs"] = self._array("gradient", "pairs", (self.worlds, rows))
+        found |= {name: self._array("gradient", name, (self.worlds, self.dyn.scene.contact_count)) for name in VALUES}
         found[derivatives.POSES] = self._array("gradient", "poses", solver.poses.shape)
-        names = "tau", "q", "qd", "target_q", "target_qd", "screws", "touches", "surfaces", "motors", "pairs"
+        names = "tau", "q", "qd", "target_q", "target_qd", "screws", "touches", "surfaces", "motors", *VALUES
         threads = self.worlds * (joint_space.BLOCK if self.device.is_cuda else 1)
         inputs = [self.worlds, *read, h, float(count), cotangent]
         outputs = [work, solved, gains, *(found[name] for name in names)]

@@ -39,7 +39,7 @@ from ..operation import (
     required,
 )
 from ..trial_inputs import rotations
-from . import contact_gradients, contact_options, integrators
+from . import contact_gradients, contact_options, integrators, joint_space_gradients
 from .integrators import INTEGRATORS, StepArrays
 from .joint_space import reason_against_gradients
 from .midpoint_contact import INTEGRATE_VJP
@@ -107,6 +107,11 @@ def _without_gradient(dyn: Dynamics, arguments: dict[str, Any]) -> str:
         return "actuators delay ctrl; expected a scene without delays, whose buffers have no gradients"
     if arguments.get("rounds") and not dyn.scene.contacts:
         return f"rounds is {arguments['rounds']} without contacts; expected rounds=None, which has gradients"
+    if dyn.scene.contact_pairs:
+        known = ", ".join(joint_space_gradients.VALUES)
+        for name, tensor in dyn.values.tensors.items():
+            if name in DIFFERENTIABLE and name not in joint_space_gradients.VALUES and tensor.requires_grad:
+                return f"{name} requires grad where bodies touch each other; expected of values {known} alone there"
     for name in ("status", *integrators.BODIES, *contact_options.REPORTS):
         if arguments.get(name) is not None and arguments.get("substeps", 1) != 1:
             return f"{name} is given with substeps; expected one of the two"
