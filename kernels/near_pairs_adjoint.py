@@ -20,6 +20,7 @@ from .near_pairs import pair_text, text_of
 
 STEP = 1e-5
 """Of the differences: in shares of the radius of the ball around the smaller shape, and in radians."""
+LEAST = 1e-3  # radius of the ball around a smaller shape, a point among them, that is taken in its place [m]
 MOST_MOVED = 300.0  # steps by which a point, or in radians a normal, may move and still be the same
 
 PAIR_BACK = {
@@ -35,7 +36,7 @@ const REAL* const found = touches.data + (world * NEAR + k) * (MOST * POINT);
 const REAL* const bar = touches_bar.data + (world * NEAR + k) * (MOST * POINT);
 const REAL balls[2] = {sides.data[2 * pair * SIDE + SIDE - 1], sides.data[(2 * pair + 1) * SIDE + SIDE - 1]};
 const int moves = balls[0] <= balls[1] ? 0 : 1;
-const REAL size = balls[moves], towards = moves ? -1 : 1;
+const REAL size = balls[moves] > (REAL)LEAST ? balls[moves] : (REAL)LEAST, towards = moves ? -1 : 1;
 REAL base[MOST * POINT], moved[2][MOST * POINT], relative[6] = {0, 0, 0, 0, 0, 0}, both[6] = {0, 0, 0, 0, 0, 0};
 bool same[2], known = false;
 for (int trial = -1; trial < 12; ++trial) {
@@ -147,7 +148,7 @@ def narrow_back(pairs: int, near: int, routines: tuple[str, ...]) -> wp.Kernel:
     of the body, of the first body and then of the second one, which do the work of the change.
     """
     text = pair_text(PAIR_BACK, pairs, near, wp.float64)
-    text = text.replace("SHARE", repr(STEP)).replace("MOST_MOVED", repr(MOST_MOVED))
+    text = text.replace("SHARE", repr(STEP)).replace("MOST_MOVED", repr(MOST_MOVED)).replace("LEAST", repr(LEAST))
     text = convex_pairs.definition(wp.float64, routines) + text
     return native.kernel("narrow_phase_back", text, [*PLACED, ("touches_bar", 2), ("wrenches", 2)], wp.float64)
 

@@ -13,7 +13,7 @@ SHAPES = {
     "box": dict(box=((TIP, 0.04, 0.03), (0.0, 0.0, 0.0, 0.02, 0.03, 0.05, np.sqrt(1.0 - 0.0038)))),
 }
 FOURTH = ((1.0, 8.0), (-1.0, -8.0), (2.0, -1.0), (-2.0, 1.0))  # moves, and weights in twelve steps
-SIZES = {"x": 1e-6, "qd": 1e-5, "tau": 1e-3, "body_f": 1e-3, "target_q": 1e-4, "target_qd": 1e-4, "ctrl": 1e-4}
+SIZES = {"x": 1e-6, "qd": 1e-5, "tau": 1e-3, "body_f": 1e-3, "target_q": 1e-4, "target_qd": 1e-4, "ctrl": 2e-3}
 SAME = 1e-4  # share of an entry by which differences of two sizes agree where there is no switch
 
 
@@ -28,8 +28,6 @@ def finger(shape="sphere", friction=0.5, ground=0.5, **more):
     ]
     cube = spo.Body(0.5, inertia=0.5 * (2.0 * HALF) ** 2 / 6.0 * np.eye(3))
     box = dict(box=(HALF, HALF, HALF))
-    name, *sizes = next(iter(SHAPES[shape].items()))
-    del name, sizes
     tip = _moved(SHAPES[shape])
     contacts = [
         spo.Contact(2, **box, friction=ground),
