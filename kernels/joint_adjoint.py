@@ -38,9 +38,9 @@ ARGUMENTS = [
 ]  # fmt: skip
 """Names and numbers of axes: what a step reads, the gradient by its rates [world, dof], memory of :func:`work_size`.
 
-``solved``, ``gains`` [world, pass * dof]: -h lambda, and x / h. The others are gradients; those by ``q`` and targets are
-the part that the laws of the joints have, that by ``qd`` all but what bias force and surfaces have. By the values of
-contacts [world, contact] they are whole for pairs, and lack what push and damping of surfaces have.
+``solved``, ``gains`` [world, pass * dof]: -h lambda, and x / h. The others are gradients. Those by ``q`` and targets
+are the part that the laws of the joints have, that by ``qd`` all but what bias force and surfaces have. By the values
+of contacts [world, contact] they are whole for pairs, and lack what push and damping of surfaces have.
 """
 
 BEFORE = r"""
@@ -59,9 +59,10 @@ BACK = r"""
 SYNC
 // -- back through the passes; gradients by each quantity end with _b
 REAL *const x_b = history + (long long)pass_count * KEPT, *const v0_b = x_b + N, *const drive_b = v0_b + N,
-    *const dry_b = drive_b + N, *const lambda = dry_b + N, *const share_b = lambda + N, *const across_b = share_b + LAWS,
-    *const spring_b = across_b + S, *const kd_b = spring_b + S, *const mu_b = kd_b + S, *const u_b = mu_b + S,
-    *const u0_b = u_b + 3 * S, *const J_b = u0_b + 3 * S, *const bars_end = J_b + 6 * MB * S;
+    *const dry_b = drive_b + N, *const lambda = dry_b + N, *const share_b = lambda + N,
+    *const across_b = share_b + LAWS, *const spring_b = across_b + S, *const kd_b = spring_b + S,
+    *const mu_b = kd_b + S, *const u_b = mu_b + S, *const u0_b = u_b + 3 * S, *const J_b = u0_b + 3 * S,
+    *const bars_end = J_b + 6 * MB * S;
 EACH (i, bars_end - x_b) x_b[i] = 0;
 EACH (i, q_bar.shape[1]) q_bar.data[world * q_bar.shape[1] + i] = target_q_bar.data[world * q_bar.shape[1] + i] = 0;
 EACH (i, DOFS) tau_bar.data[world * DOFS + i] = target_qd_bar.data[world * DOFS + i] = 0;
@@ -77,7 +78,7 @@ EACH (i, N) {
 SYNC
 LOOP
 for (int number = pass_count - 1; number >= 0; --number) {
-    const bool first = number == 0, last = number == pass_count - 1 && pass_count >= 3;
+    const bool first = number == 0;
     const REAL *const kept = history + (long long)number * KEPT, *const old = kept - KEPT;
     const REAL *const now_dof = kept + K_DOF, *const now_slot = kept + K_SLOT, *const now_x = now_dof + X * N;
     const REAL *const old_dof = old + K_DOF, *const old_slot = old + K_SLOT, *const old_x = old_dof + X * N;
@@ -238,7 +239,8 @@ for (int number = pass_count - 1; number >= 0; --number) {
             if (low && high) {
                 const REAL size = joint_space::size_of(line), way = line < 0 ? -1 : 1;
                 const int bounded = line > 0 ? 3 : 2;
-                const REAL bound = joint_space::positive(line > 0 ? greatest : -least), earlier = first ? 0 : old[K_SHARE + l];
+                const REAL bound = joint_space::positive(line > 0 ? greatest : -least);
+                const REAL earlier = first ? 0 : old[K_SHARE + l];
                 const REAL beyond = first ? 0 : joint_space::positive(FMA(earlier, size, -bound));
                 const REAL more = scale * law[1] * (h * value[C_WEIGHT] * beyond), share = kept[K_SHARE + l];
                 const bool outside = (least > 0 || greatest < 0) && (line > 0 ? greatest : -least) < 0;
@@ -297,7 +299,8 @@ for (int number = pass_count - 1; number >= 0; --number) {
                 if (!(on >> side & 1)) continue;
                 const REAL way = side ? -1 : 1, depth = way * (value[C_LOWER + side] - at), inward = way * v;
                 const REAL k = value[C_LIMIT_KE], d = FMA(h, k, depth > 0 ? value[C_LIMIT_KD] : 0);
-                const bool held = first ? FMA(h, joint_space::positive(-inward), depth) > 0 : FMA(k, depth, -(d * inward)) > 0;
+                const bool held = first ? FMA(h, joint_space::positive(-inward), depth) > 0
+                                        : FMA(k, depth, -(d * inward)) > 0;
                 at_b -= held || depth > 0 ? k * force_b : 0;
             }
             q_bar.data[there] += at_b;

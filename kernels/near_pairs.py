@@ -248,6 +248,7 @@ if (convex::passes_by(shape[0], shape[1], tables, at[0], turn[0], at[1], turn[1]
 
 
 def text_of(body: str, pairs: int, near: int, T: type) -> str:
+    """Return the native text ``body`` with the sizes of a scene, for scalars of type ``T``."""
     sizes = {
         "PAIRS": pairs, "NEAR": near, "SIDE": len(SIDE), "ARM": SIDE.index("arm"), "BOX": SIDE.index("size_x"),
         "COM": SIDE.index("com_x"),
@@ -293,6 +294,7 @@ def passing(pairs: int, near: int, T: type, routines: tuple[str, ...]) -> wp.Ker
 
 
 def pair_text(parts: dict[str, str], pairs: int, near: int, T: type) -> str:
+    """Return the native text of a thread that takes a near pair; ``parts``: by name, what takes their place in PAIR."""
     text = PAIR
     for name, part in parts.items():
         text = text.replace(f"\n{name}\n", f"\n{part.strip()}\n" if part else "\n")

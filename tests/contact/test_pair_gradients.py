@@ -115,7 +115,12 @@ BUGS = {
     "normals held": (joint_adjoint, "RESULTS", "joint_space::cross(tilt, axes, to + 3);", "tilt[0] = 0;"),
     "pushes held": (joint_adjoint, "BACK", "push_b = pushes ? fn_b : 0;", "push_b = 0;"),
     "velocities before held": (joint_adjoint, "BACK", "u0_b[3 * at] -= h * kd * pushed[0];", "u0_b[3 * at] -= 0;"),
-    "places held": (near_pairs_adjoint, "PAIR_BACK", "(up[i * POINT + c] - down", "(c > 2) * (up[i * POINT + c] - down"),
+    "places held": (
+        near_pairs_adjoint,
+        "PAIR_BACK",
+        "(up[i * POINT + c] - down",
+        "(c > 2) * (up[i * POINT + c] - down",
+    ),
     "poses held": (near_pairs_adjoint, "SUMS", "to[c] = f[c];", "to[c] = 0;"),
 }
 
@@ -235,7 +240,9 @@ def test_gradients_that_do_not_exist_have_names():
     bodies = [spo.Body(1.0, inertia=0.01 * np.eye(3)) for _ in range(2)]
     pair = spo.Scene(bodies, [spo.Hinge("free", -1, body) for body in range(2)], contacts=balls, ground=spo.Plane())
     q = torch.tensor(pair.neutral_q[None], dtype=torch.float32, requires_grad=True)
-    with pytest.raises(spo.UnsupportedError, match="contact between bodies .* is not supported; leave out contacts"):
+    with pytest.raises(
+        spo.UnsupportedError, match=r"contact between bodies \(.*\) is not supported; leave out contacts"
+    ):
         spo.Dynamics(pair, 1, "cpu").step(q, torch.zeros((1, 12)), None, H)
 
 

@@ -91,7 +91,7 @@ def errors(dyn, q, a, steps=1, options=None, seed=0):
     a, found = tensors(dyn, a), {}
     cotangents = [torch.tensor(rng.normal(size=(worlds, n))) for n in (dyn.scene.coord_count, dyn.scene.dof_count)]
     gradients = torch.autograd.grad(outcome(dyn, q, a, cotangents, steps, options).sum(), list(a.values()))
-    for (name, tensor), mine in zip(a.items(), gradients, strict=True):
+    for name, mine in zip(a, gradients, strict=True):
         wanted = torch.full_like(mine, torch.nan).reshape(worlds, -1)
         for entry in range(wanted.shape[1]):
             rates = []

@@ -198,7 +198,9 @@ class JointSpaceStep:
         kinds += [array(np.ravel(each)) for each in (rows.corners, rows.planes)]
         self.shapes = kinds + [array(each, dtype=int) for each in (rows.starts, rows.loops)]
         kernels = near_pairs.narrow, near_pairs.passing
-        self.narrow, self.passing = (each(self.tables.sizes.pairs, self.near_count, T, self.routines) for each in kernels)
+        self.narrow, self.passing = (
+            each(self.tables.sizes.pairs, self.near_count, T, self.routines) for each in kernels
+        )
 
     def _launch(self, kernel: Any, threads: int, inputs: list, outputs: list, block: int = 64) -> None:
         launches.launch(kernel, threads, [self.worlds, *inputs], outputs, device=self.device, block_dim=block)

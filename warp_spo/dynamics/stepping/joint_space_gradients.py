@@ -1,16 +1,15 @@
 """Gradients of a step of a scene whose bodies touch: its passes once more, and then back through each of them.
 
-The way back of the passes is :mod:`warp_spo.kernels.joint_adjoint`. What it leaves are gradients by points, surfaces and
+The way back of the passes is :mod:`warp_spo.kernels.joint_adjoint`. It leaves gradients by points, by surfaces and by
 screws of dofs, which go on to q through the narrow phase (:mod:`warp_spo.kernels.near_pairs_adjoint`) and through the
-trace of the system, and for each pass a product of mass matrix and bias force, whose gradient is that of inverse
-dynamics.
+trace of the system. It also leaves, for each pass, a product of mass matrix and bias force, whose gradient is that of
+inverse dynamics.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 import warp as wp
 
 from ...execution.routine import Routine
@@ -21,9 +20,6 @@ from ...recursions.derivatives import joint_system as derivatives
 from ...recursions.derivatives.adjoints import result_name
 from ...runtime import launches
 from .joint_space import JointSpaceStep
-
-if TYPE_CHECKING:
-    from ..dynamics import Dynamics
 
 SYSTEM = Routine("joint_system_vjp", derivatives.joint_system_vjp)
 STATE = Routine("joint_state_vjp", derivatives.joint_state_vjp)
@@ -40,23 +36,22 @@ class JointSpaceGradients:
 
     def __init__(self, solver: JointSpaceStep):
         self.solver, self.dyn = solver, solver.dyn
-        self.device, self.worlds, T = solver.device, solver.worlds, solver.dyn.dtype
+        self.device, self.worlds = solver.device, solver.worlds
+        T: Any = solver.dyn.dtype
         sizes = solver.tables.sizes
         self.kernel = joint_adjoint.adjoint(sizes, T)
         near, pairs = solver.near_count, sizes.pairs
         self.narrow_back = near_pairs_adjoint.narrow_back(pairs, near, solver.routines)
         self.add_wrenches = near_pairs_adjoint.add_wrenches(pairs, near)
         self.widen, self.narrow = (near_pairs_adjoint.widen(*both) for both in ((T, wp.float64), (wp.float64, T)))
-        self.wrenches = self._make(self.worlds, 12 * near, dtype=wp.float64)
+        self.wide: dict[str, wp.array] = {}
+        self.wrenches = wp.zeros((self.worlds, 12 * near), dtype=wp.float64, device=self.device)
         wide: dict[int, wp.array] = {}
         constants = [solver.sides, *solver.shapes]
         for array in constants:
             if array.dtype is not wp.int32:
                 wide[id(array)] = wp.array(array.numpy(), dtype=wp.float64, device=self.device)
         self.sides, *self.shapes = (wide.get(id(array), array) for array in constants)
-
-    def _make(self, *shape: int, dtype: Any = None) -> wp.array:
-        return wp.zeros(shape, dtype=dtype or self.dyn.dtype, device=self.device)
 
     def _array(self, *key: Any) -> wp.array:
         """Return the array of a name, or of a name and numbers, with the shape that follows."""
@@ -93,9 +88,9 @@ class JointSpaceGradients:
         systems = {name: self._array("system", name, results[name].shape) for name in by_system}
         options: dict[str, Any] = dict(pairs=tuple(solver.tables.pairs), motors=solver.motor_laws)
         options["surfaces"] = bool(solver.tables.sizes.surfaces)
-        names = (joint_system.SCREWS, derivatives.POSES)
-        names += (joint_system.SURFACES,) if options["surfaces"] else ()
-        names += (joint_system.OF_MOTORS,) if solver.tables.sizes.laws else ()
+        names = [joint_system.SCREWS, derivatives.POSES]
+        names += [joint_system.SURFACES] * options["surfaces"]
+        names += [joint_system.OF_MOTORS] * bool(solver.tables.sizes.laws)
         seeds = {f"{name}_bar": found[name] for name in names}
         self._pull(SYSTEM, systems, q=q, qd=qd, dt=h, **inputs, **seeds, **options)
         for source in (states, {name: found[name] for name in (*LAWS, *VALUES)}, systems):
@@ -154,7 +149,8 @@ class JointSpaceGradients:
 
     def _points_back(self, h: float, touches_bar: wp.array, poses_bar: wp.array) -> None:
         """Launch the gradients by the poses of the bodies from those by the points of near pairs."""
-        solver, on = self.solver, {"device": self.device, "block_dim": 64}
+        solver = self.solver
+        on: dict[str, Any] = {"device": self.device, "block_dim": 64}
         wide = {name: self._wide(name, array) for name, array in
                 (("poses", solver.poses), ("velocities", solver.velocities), ("touches", solver.touches),
                  ("touches_bar", touches_bar))}  # fmt: skip
@@ -172,12 +168,11 @@ class JointSpaceGradients:
         """Return an array in float64, the array itself if it is one."""
         if array.dtype is wp.float64:
             return array
-        known = self.__dict__.setdefault("_wide_arrays", {})
-        if name not in known:
-            known[name] = self._make(*array.shape, dtype=wp.float64)
+        if name not in self.wide:
+            self.wide[name] = wp.zeros(array.shape, dtype=wp.float64, device=self.device)
         if copy:
-            launches.launch(self.widen, array.size, [array.flatten()], [known[name].flatten()], device=self.device)
-        return known[name]
+            launches.launch(self.widen, array.size, [array.flatten()], [self.wide[name].flatten()], device=self.device)
+        return self.wide[name]
 
     def _combine(self, a: float, x: wp.array, b: float, y: wp.array, out: wp.array) -> None:
         self.dyn.recursions.launch(combination.combine, out.shape, [a, x, b, y], [out])
