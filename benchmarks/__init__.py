@@ -19,7 +19,7 @@ Contact:
 Learning:
     ``env_times`` (parts of a step of an environment), ``actuator_nets`` (what learned actuators cost), ``training``
     (env-steps/s), ``learner`` (ways to learn, as graphs and not), ``learning_curves``, ``watched_training`` (the price
-    of a page), ``mdp/`` (do the ready tasks compute what their pages say?), ``guard`` (trainings with numbers that are
+    of a page and of keeping failures; ``page_client`` looks at it), ``mdp/`` (do the ready tasks compute what their pages say?), ``guard`` (trainings with numbers that are
     spoilt), ``failures`` (their cost and the bits of replays), ``killed_trainings`` (``kill -9`` and ``--resume
     latest``; a CPU), ``installed_tasks`` (a package with tasks, by pip; a CPU).
 Documentation and refactoring:
