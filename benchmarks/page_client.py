@@ -22,8 +22,8 @@ CAMERA = {
 }  # fmt: skip
 
 
-def read(url: str) -> int:
-    """Read what the page at an address sends until its server ends; return the number of messages."""
+def read(url: str, least: float = float("inf")) -> int:
+    """Read what the page at an address sends until its server ends, or ``least`` messages; return their number."""
     import msgspec
     import viser
     from websockets.exceptions import ConnectionClosed
@@ -36,6 +36,8 @@ def read(url: str) -> int:
         with contextlib.suppress(ConnectionClosed):
             for _ in connection:
                 count += 1
+                if count >= least:
+                    break
     return count
 
 

@@ -368,7 +368,7 @@ def load_with_notes(file: Path, contacts: Any, options: dict[str, Any]) -> tuple
     """
     from ..newton import load
 
-    notes: list[str] = []
+    notes, chosen = list[str](), file.suffix.lower() != ".urdf" or "ground" in options
 
     def read(contacts: Any) -> Scene:
         with warnings.catch_warnings(record=True) as caught:
@@ -384,5 +384,5 @@ def load_with_notes(file: Path, contacts: Any, options: dict[str, Any]) -> tuple
     except (ValueError, ImportError) as error:  # of a shape; without contacts the file may do
         refusal = str(error)
         scene = read(None)
-        return scene, [*notes, f"no contacts: {refusal}"], True
-    return scene, notes, file.suffix.lower() != ".urdf" or "ground" in options
+        return scene, [*notes, f"no contacts: {refusal}"], chosen
+    return scene, notes, chosen
