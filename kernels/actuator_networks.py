@@ -82,9 +82,9 @@ class Joints(NamedTuple):
             f"const float rate = {qd.format('dof')};",
         ]
         for lag in filter(None, self.lags):
-            slot = f"slot_{lag}"
+            slot, row = f"slot_{lag}", f"2 * ((age - {lag} + {slots}) % {slots}) * {count} + joint"
             text += [
-                f"const long long {slot} = (2 * ((age - {lag} + {slots}) % {slots}) * {count} + joint) * columns + world;",
+                f"const long long {slot} = ({row}) * columns + world;",
                 f"const float error_{lag} = age >= {lag} ? {ring}[{slot}] : 0.0f;",
                 f"const float rate_{lag} = age >= {lag} ? {ring}[{slot} + {count} * columns] : 0.0f;",
             ]
@@ -237,7 +237,7 @@ def before_substep(joints: Joints, number: int, together: int) -> Before:
             f"network{suffix}::torques(staged + first * {half.staged}, weights{suffix}.data, each);",
             "#pragma unroll",
             f"for (int k = 0; k < {together}; ++k) {{",
-            f"const int joint = warp + warps * (first + k);",
+            "const int joint = warp + warps * (first + k);",
             f"if (joint >= {joints.count}) break;",
             f"const int dof = {_indexed('dofs' + suffix, joints.dofs)};",
             "const float found = each[k];",
@@ -251,7 +251,9 @@ def before_substep(joints: Joints, number: int, together: int) -> Before:
     def scalars(warps: int) -> int:
         return 0 if half is None else -(-joints.count // (warps * together)) * warps * together * half.staged
 
-    return Before(joints.define(suffix, together), "\n".join([*text, *cuda, "}"]), "\n".join([*text, *cpu, "}"]), scalars)
+    return Before(
+        joints.define(suffix, together), "\n".join([*text, *cuda, "}"]), "\n".join([*text, *cpu, "}"]), scalars
+    )
 
 
 def _number(x: float) -> str:

@@ -27,7 +27,6 @@ from .shared_rows import (
 )
 from .substeps import (
     STATE,
-    SYNC,
     Before,
     hold_state,
     move_state,
@@ -192,7 +191,8 @@ class _Places:
     Attributes:
         rows: of rows and further results in shared memory, by name.
         result: of the result, and its width for a world; 0, 0 where substeps write the state.
-        messages: of what warps send each other. spill_slots: of what threads set aside. before: of code before substeps.
+        messages: of what warps send each other. spill_slots: of what threads set aside.
+        before: of what code before substeps uses.
     """
 
     def __init__(self, layout: KernelLayout):

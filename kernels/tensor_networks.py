@@ -1,16 +1,16 @@
 """Small networks of dense layers on tensor cores, with errors as of float32; a warp has 32 rows, or several times 32.
 
 A product of tensor cores takes 11 bits of each factor, so each factor is a sum of two such parts, and a product three
-products: high high, high low, low high (Ootomo and Yokota 2022, "Recovering single precision accuracy from Tensor
-Cores"). The first layer, whose inputs may have any size, is in TF32. The others are in float16, twice as fast: what an
-activation within [-1, 1] gives is multiplied by SCALE, and the weights of a layer by a power of two.
+products: low high, high low, high high (Ootomo and Yokota 2022, "Recovering single precision accuracy from Tensor
+Cores"). The first layer, whose inputs may have any size, is in TF32. The others are in float16, twice as fast: outputs
+of an activation within [-1, 1] are multiplied by SCALE, and the weights of a layer by a power of two.
 
-Of a product [16, 32 inputs] x [inputs, outputs] lane 4 g + t of a warp holds outputs 8 n + 2 t and 8 n + 2 t + 1 of rows
+Of a product [16, inputs] x [inputs, outputs] lane 4 g + t of a warp holds outputs 8 n + 2 t and 8 n + 2 t + 1 of rows
 g and g + 8, which are what the next product wants of it; so nothing moves between lanes until the last layer.
 
-Weights are one array of 32-bit words, in order of the layers: of the first and of each hidden one, for each 16 (first:
-8) inputs, 8 outputs and lane the words (high 0, high 1, low 0, low 1) of the product's second factor; then the biases of
-its outputs. Of the last layer: its weights / SCALE, then its bias. Biases of hidden layers are multiplied by their scale.
+Weights are one array of 32-bit words, layer by layer. Of the first and of each hidden one, for each 16 (first: 8) inputs,
+8 outputs and lane: the words high 0, high 1, low 0, low 1 of the product's second factor; then the biases of its
+outputs, multiplied by the layer's scale. Of the last layer: its weights / SCALE, then its bias.
 """
 
 from typing import NamedTuple
@@ -19,6 +19,7 @@ SCALE = 1024.0  # of the outputs of activations
 PITCH = 40  # of the inputs of 32 rows in shared memory: four inputs of eight rows lie in different banks
 MOST_INPUTS, MOST_UNITS = 16, 64
 BOUNDED = ("softsign", "tanh")
+PAIRS = True  # softsign takes one reciprocal for two sums
 
 
 class Shape(NamedTuple):
@@ -52,25 +53,18 @@ class Shape(NamedTuple):
 PRODUCTS = r"""
 struct on_tensor_cores
 {
-    static __device__ inline void tf32(float (&c)[4], const unsigned (&a)[4], unsigned b0, unsigned b1)
+    static __device__ inline void tf32(float* c, const unsigned* a, unsigned b0, unsigned b1)
     {
         asm("mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, "
             "{%0, %1, %2, %3};" : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
             : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
     }
 
-    static __device__ inline void half(float (&c)[4], const unsigned (&a)[4], unsigned b0, unsigned b1)
+    static __device__ inline void half(float* c, const unsigned* a, unsigned b0, unsigned b1)
     {
         asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, "
             "{%0, %1, %2, %3};" : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
             : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
-    }
-
-    static __device__ inline unsigned to_tf32(float x)
-    {
-        unsigned y;
-        asm("cvt.rna.tf32.f32 %0, %1;" : "=r"(y) : "f"(x));
-        return y;
     }
 
     static __device__ inline unsigned to_half(float low, float high)
@@ -143,8 +137,8 @@ def define(name: str, shape: Shape, joints: int) -> str:
             text += [
                 f"const float x = staged[(m / 2) * {shape.staged} + (8 * step + t + 4 * (i / 2)) * {PITCH}"
                 " + 16 * (m & 1) + g + 8 * (i & 1)];",
-                "high[m][i] = on_tensor_cores::to_tf32(x);",
-                "low[m][i] = on_tensor_cores::to_tf32(x - __uint_as_float(high[m][i]));",
+                "high[m][i] = __float_as_uint(x) & 0xffffe000u;  // NaN and infinity stay what they are",
+                "low[m][i] = __float_as_uint(x - __uint_as_float(high[m][i])) + 0x1000u;  // rounded when it is read",
             ]
         else:
             text += [
@@ -210,10 +204,13 @@ def define(name: str, shape: Shape, joints: int) -> str:
 
 
 def _activation(name: str) -> list[str]:
-    """Return the definition of ``activate(a, b, scale)``: of two sums, multiplied by ``scale``, to SCALE times theirs."""
+    """Return the definition of ``activate(a, b, scale)``: two sums, times ``scale``, become outputs times SCALE."""
     start = "static __device__ inline void activate(float& a, float& b, float scale) {"
     if name == "tanh":
         return [start, f"a = {SCALE!r}f * tanhf(a * (1.0f / scale)); b = {SCALE!r}f * tanhf(b * (1.0f / scale)); }}"]
+    if not PAIRS:
+        one = "{0} *= on_tensor_cores::over(__fmaf_rn(fabsf({0}), {1!r}f, scale * {1!r}f));"
+        return [start, one.format("a", 1 / SCALE), one.format("b", 1 / SCALE), "}"]
     return [
         start,
         f"const float c = __fmaf_rn(fabsf(a), {1 / SCALE!r}f, scale * {1 / SCALE!r}f);",

@@ -59,9 +59,7 @@ class ActuatorLaunches:
             half = tensor_weights.shape_of(part.network) if TENSOR_CORES and _has_tensor_cores(device) else None
             weights = zero if half is None else torch.tensor(tensor_weights.pack(part.network, half))
             layers, *others = part.network.text
-            joints = Joints(
-                () if half else layers, *others, at, dofs, sizes, layout.memory[AGE][0], decimation, half
-            )
+            joints = Joints(() if half else layers, *others, at, dofs, sizes, layout.memory[AGE][0], decimation, half)
             buffers = {name: store.buffers[name] for name in ("q", "qd", "memory", "tau")}
             buffers |= {"target": store.buffers[part.array], "force": force}
             buffers |= {"limit": store.buffers[limits] if own else Buffer(shared)}
