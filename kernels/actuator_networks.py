@@ -71,6 +71,11 @@ class Joints(NamedTuple):
         """Number of joints."""
         return len(self.dofs)
 
+    @property
+    def products(self) -> int:
+        """Number of weights in the text."""
+        return sum(len(weights) * len(weights[0]) for weights, _ in self.layers)
+
     def gather(self, suffix: str = "", q: str = "q_row[{}]", qd: str = "qd_row[{}]") -> list[str]:
         """Return code that reads the inputs of ``joint`` into ``x`` and keeps them, where ``keeps`` is set."""
         count, slots = self.count, max(self.lags)

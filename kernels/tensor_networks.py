@@ -8,9 +8,9 @@ of an activation within [-1, 1] are multiplied by SCALE, and the weights of a la
 Of a product [16, inputs] x [inputs, outputs] lane 4 g + t of a warp holds outputs 8 n + 2 t and 8 n + 2 t + 1 of rows
 g and g + 8, which are what the next product wants of it; so nothing moves between lanes until the last layer.
 
-Weights are one array of 32-bit words, layer by layer. Of the first and of each hidden one, for each 16 (first: 8) inputs,
-8 outputs and lane: the words high 0, high 1, low 0, low 1 of the product's second factor; then the biases of its
-outputs, multiplied by the layer's scale. Of the last layer: its weights / SCALE, then its bias.
+Weights are one array of 32-bit words, layer by layer. Of the first and of each hidden one, for each 16 (first: 8)
+inputs, 8 outputs and lane: the words high 0, high 1, low 0, low 1 of the product's second factor; then the biases of
+its outputs, multiplied by the layer's scale. Of the last layer: its weights / SCALE, then its bias.
 """
 
 from typing import NamedTuple

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 BLOCK = 128  # threads
 JOINED_ON = ("cuda",)  # kinds of devices on which the kernel of the step evaluates networks; on a CPU nothing is gained
+MOST_JOINED = 4096  # products of a network whose weights stand in the text of the step's kernel; more is much code
 TENSOR_CORES = True  # layers of networks with bounded activations, on GPUs
 TOGETHER = 3  # joints whose layers a warp evaluates side by side in the kernel of the step
 
@@ -33,7 +34,6 @@ class ActuatorLaunches:
     Args:
         parts: actions with a network. layout: of the environment. store: its arrays. decimation: steps of the dynamics
             in a step. device: where they run.
-
     """
 
     def __init__(
@@ -50,6 +50,7 @@ class ActuatorLaunches:
             self._mean = torch.zeros_like(self._force)
             force = store.buffers["contact_f"]
         self._kernels: list[tuple[wp.Kernel, list[Any], int]] = []
+        self._joints: list[Joints] = []
         self._before: list[tuple[Before, dict[str, wp.array]]] = []
         for number, part in enumerate(parts):
             hinges = part.hinges(scene)
@@ -58,8 +59,20 @@ class ActuatorLaunches:
             sizes = scene.coord_count, scene.dof_count, scene.dof_count if own else 0
             half = tensor_weights.shape_of(part.network) if TENSOR_CORES and _has_tensor_cores(device) else None
             weights = zero if half is None else torch.tensor(tensor_weights.pack(part.network, half))
-            layers, *others = part.network.text
-            joints = Joints(() if half else layers, *others, at, dofs, sizes, layout.memory[AGE][0], decimation, half)
+            layers, activation, lags, error_first, scales = part.network.text
+            joints = Joints(
+                layers=() if half else layers,
+                activation=activation,
+                lags=lags,
+                error_first=error_first,
+                scales=scales,
+                coordinates=at,
+                dofs=dofs,
+                sizes=sizes,
+                age=layout.memory[AGE][0],
+                decimation=decimation,
+                half=half,
+            )
             buffers = {name: store.buffers[name] for name in ("q", "qd", "memory", "tau")}
             buffers |= {"target": store.buffers[part.array], "force": force}
             buffers |= {"limit": store.buffers[limits] if own else Buffer(shared)}
@@ -68,6 +81,7 @@ class ActuatorLaunches:
             buffers |= {"weights": Buffer(weights.to(store.device))}
             arrays = {name: buffers[name].warp() for name in ARRAYS[:-1]}
             self._kernels.append((torques(joints, entries, BLOCK), list(arrays.values()), len(hinges)))
+            self._joints.append(joints)
             code = before_substep(joints, number, TOGETHER)
             self._before.append((code, {f"{name}_{number}": arrays[name] for name in OWN}))
 
@@ -83,6 +97,8 @@ class ActuatorLaunches:
         kind = "cuda" if self._device.is_cuda else "cpu"
         routine = contact_routine(dyn) if dyn.scene.contacts else STEP
         if kind not in JOINED_ON or self._decimation == 1 or dyn.plan.of(routine) != "segment":
+            return False
+        if max(joints.products for joints in self._joints) > MOST_JOINED:
             return False
         if several_launches(dyn, "semi_implicit", acts, delays, passes):
             return False
