@@ -1,3 +1,4 @@
+import gc
 import os
 import socket
 import sys
@@ -34,6 +35,7 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    gc.set_threshold(50_000, 10, 50)  # of the many small objects of traces; by default a quarter of the time goes there
     if config.getoption("--device") == "cpu":
         os.environ.setdefault("JAX_PLATFORMS", "cpu")
     asked = config.getoption("--granularity")
