@@ -67,6 +67,17 @@ def without_optimization(make):
     return make_unoptimized
 
 
+def pytest_collection_finish(session):
+    """On the CPU Newton's kernels, which are no part of what is tested, are compiled without optimization.
+
+    Those of its kinematics alone would take nine seconds.
+    """
+    if not wp.is_cuda_available() and not session.config.getoption("--optimized"):
+        for name, module in list(sys.modules.items()):
+            if name.startswith("newton."):
+                wp.set_module_options({"optimization_level": 0}, module)
+
+
 @pytest.fixture(scope="session")
 def device(request):
     return wp.get_device(request.config.getoption("--device"))

@@ -49,7 +49,7 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
             [entry] or [world, entry].
         dtype: the precision.
     """
-    outputs, values = list(outputs), {}
+    outputs, values, dtype = list(outputs), {}, np.dtype(dtype)
     searches: dict[tuple, np.ndarray] = {}
     for scalar in ordered(outputs):
         if scalar.op == "input":
@@ -85,7 +85,7 @@ def _search(shape: str, cells: np.ndarray | None, asked: np.ndarray) -> np.ndarr
 
     ``cells``: in which it looks, [entry] or [world, entry]; None: it needs none.
     """
-    found: dict[tuple, np.ndarray] = {}  # many worlds ask the same, such as copies that differ in their velocities alone
+    found: dict[tuple, np.ndarray] = {}  # many worlds ask the same, such as copies that differ in velocity alone
     keys = []
     for at, one in enumerate(asked.reshape(-1, asked.shape[-1])):
         heights = None if cells is None else (cells if cells.ndim == 1 else cells[at])[::CORNERS]
