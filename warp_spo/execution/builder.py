@@ -10,6 +10,7 @@ from ..kernels import native, straight_line
 from ..kernels.fields import axes
 from ..kernels.native import INTEGERS
 from ..kernels.straight_line import BY_TABLE, TILED, KernelLayout
+from ..kernels.substeps import SUBSTEPS, Before
 from ..recursions.contact import coupled
 from ..recursions.contact.ground import GROUND
 from ..recursions.contact.secant_laws import SECANT
@@ -82,11 +83,13 @@ class Builder:
 
     Attributes:
         relays: what is too long for shared memory waits in the rows of the result.
+        before: code that runs before each substep of kernels that take several, and its arrays by name.
     """
 
     def __init__(self, run: Sweeps, plan: Plan):
         self.run, self.plan, self.dtype = run, plan, run.dtype.__name__
         self.relays = run.device.is_cuda
+        self.before: list[tuple[Before, dict[str, wp.array]]] = []
         self._links: Links | None = None
         self._supports_body_kinematics: bool | None = None
 
@@ -131,7 +134,8 @@ class Builder:
         wide = routine.segments is not None and routine.segments.wide and warps > 1
         room = self.room(wide, whole=whole)
         given = stores, everything, job.shapes, more, sent, warps, self.run.dtype
-        return staging.choose_layout(*given, *ways, self.relays, room, wide)
+        before = tuple(code for code, _ in self.before) if SUBSTEPS in job.shapes else ()
+        return staging.choose_layout(*given, *ways, self.relays, room, wide, before)
 
     def room(self, wide: bool = False, whole: bool = False) -> int:
         """Bytes of shared memory that a block may have: for as many scalars in float64 as in float32 if the GPU can.
@@ -173,6 +177,7 @@ class Builder:
         rows, fields = (*(row.name for row in layout.rows), *layout.numbers), tuple(layout.fields)
         arrays = [(row.name, row.ndim) for row in layout.rows] + [(name, 0) for name in layout.numbers]
         arrays += [(name, axes(name)) for name in fields]
+        tables = tables | {name: array for _, arrays in self.before for name, array in arrays.items() if layout.before}
         result, entry, places = layout.result, None, ()
         if result.way in BY_TABLE:
             tables = tables | {"place": result.slot_layout.table(tables["place"], self.run.dtype)}

@@ -81,6 +81,7 @@ def semi_implicit(
     passes: int | None = None,
     rounds: int | None = None,
     substeps: int = 1,
+    joint_space: bool = False,
     **given: Any,
 ) -> None:
     """Launch the implicit step of order 1.
@@ -89,6 +90,7 @@ def semi_implicit(
         qdd, status: arrays to fill, see :meth:`Dynamics.step`; reports: others, by name. bodies: arrays for poses and
             velocities of the bodies after the step. passes: of scenes with contacts. rounds: of the midpoint scheme.
         substeps: more than one only where :func:`several_launches` names no reason against it.
+        joint_space: solve pairs of bodies in joint space, even where generated code is chosen: for the way back.
         given: forces and targets by name. With ``q_from``, ``qd_from`` the step starts from that state, while its sweep
             and the laws of its joints are evaluated at q, qd.
     """
@@ -101,9 +103,10 @@ def semi_implicit(
     given |= {SUBSTEPS: float(substeps)} if substeps > 1 else {}
     if dyn.scene.contacts:
         count = float(pairs.default_passes(dyn.scene) if passes is None else passes)
-        if dyn._joint_space is not None:
+        solver = dyn._joint_gradients.solver if joint_space else dyn._joint_space
+        if solver is not None:
             asks = {name.removesuffix("_out"): array for name, array in asked.items()} | (reports or {})
-            dyn._joint_space.launch(q, qd, (q_out, qd_out), dt, int(count), asks, **given)
+            solver.launch(q, qd, (q_out, qd_out), dt, int(count), asks, **given)
             if bodies is not None:
                 write_bodies(dyn, q_out, qd_out, bodies)
             return

@@ -63,6 +63,16 @@ def reason_against(dyn: Dynamics) -> tuple[str, str]:
     return (lacks, way_out(lacks)) if lacks else (NO_ROOM, NO_ROOM_WAY)
 
 
+def reason_against_gradients(scene: Scene, variable: tuple[str, ...]) -> str:
+    """Return why steps of a scene whose bodies touch have no gradients; "" if they have."""
+    if scene.dof_count == 0:
+        return "nothing can move"
+    lacks = lacking(scene, variable)
+    if lacks:
+        return f"{lacks} have no solution in joint space"
+    return "anchors vary" if {"joint_X_p", "joint_X_c"} & set(variable) else ""
+
+
 def choose_slots(scene: Scene) -> tuple[int, int]:
     """Return how many pairs may be near in a world, and how many of their points get slots."""
     pairs = scene.contact_pairs
@@ -186,12 +196,14 @@ class JointSpaceStep:
                 sides.append([*at, *shape.pose[3:], *sizes, *com, float(np.linalg.norm(at - com)) + ball, ball])
         assert not sides or len(sides[0]) == len(near_pairs.SIDE)
         self.which, self.sides = array(np.ravel(which), dtype=int), array(np.ravel(sides))
-        routines = rows.routines([which[i][1::2] + which[i + 1][1::2] for i in range(0, len(which), 2)])
+        self.routines = rows.routines([which[i][1::2] + which[i + 1][1::2] for i in range(0, len(which), 2)])
         kinds = [array(np.ravel(rows.rows), dtype=int), array(rows.sizes)]
         kinds += [array(np.ravel(each)) for each in (rows.corners, rows.planes)]
         self.shapes = kinds + [array(each, dtype=int) for each in (rows.starts, rows.loops)]
         kernels = near_pairs.narrow, near_pairs.passing
-        self.narrow, self.passing = (each(self.tables.sizes.pairs, self.near_count, T, routines) for each in kernels)
+        self.narrow, self.passing = (
+            each(self.tables.sizes.pairs, self.near_count, T, self.routines) for each in kernels
+        )
 
     def _launch(self, kernel: Any, threads: int, inputs: list, outputs: list, block: int = 64) -> None:
         launches.launch(kernel, threads, [self.worlds, *inputs], outputs, device=self.device, block_dim=block)

@@ -32,6 +32,7 @@ from .usd_values import (
     with_scaled_drives,
     with_weightless_bodies,
 )
+from .usd_world_joints import joints_placed_on_world, place_joints_on_world
 
 UNITS = (1e-9, 1e9)
 """Least and largest unit of length [m] and of mass [kg] of a file."""
@@ -90,12 +91,14 @@ def _read(
         if not UNITS[0] <= unit <= UNITS[1]:
             raise ValueError(f"{call}: {name} is {unit}; expected a number between {UNITS[0]:g} and {UNITS[1]:g}")
     check_values(call, stage)
+    placed = joints_placed_on_world(stage)
     prepare(call, stage)
     builder, found = _imported(stage, floating, metre**3 / kilogram)
     if builder.body_count == 0:
         raise ValueError(f"{call} has no rigid bodies; expected prims with PhysicsRigidBodyAPI")
     joints = ImportedJoints(call, stage, builder, found["path_joint_map"])
     joints.turn_offsets_of_mimics()
+    place_joints_on_world(stage, builder, found["path_joint_map"], placed)
     accelerated = joints.accelerated()
     if (metre, kilogram) != (1.0, 1.0):
         _convert(builder, metre, kilogram, found.get("physics_scene_path") is not None, accelerated)
