@@ -277,6 +277,3 @@ def test_calls_without_a_kernel_have_names(device):
     with pytest.raises(ValueError, match="contact_residual is given, and no bodies of the scene touch each other"):
         alone.step(q, qd, None, H, report=spo.StepReport(contact_residual=np.zeros(1, np.float32)))
     assert "1 pairs of bodies" in spo.Dynamics(scene, device=device).explain()
-    torch = pytest.importorskip("torch")
-    with pytest.raises(ValueError, match="contact between bodies"):
-        spo.Dynamics(scene, device="cpu").step(torch.tensor(q, requires_grad=True), torch.tensor(qd), None, H)
