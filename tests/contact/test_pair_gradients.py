@@ -268,10 +268,11 @@ def test_jax_differentiates_the_step():
         np.testing.assert_array_equal(np.asarray(one), theirs.numpy())
 
 
-def test_the_way_back_is_prepared():
-    """A prepared gradient compiles nothing, and repeats what it launched."""
+def test_the_way_back_is_prepared_and_repeated():
+    """Calls that repeat what was launched have the bits of the first one."""
     scene, q, a = fingers("sphere", "slide")
     dyn = spo.Dynamics(scene, WORLDS, "cpu", "float64")
+    dyn.prepare("step_vjp", wrt=("q", "qd", "tau"))
     mine, found = tensors(dyn, {"q": q, **a}), []
     for _ in range(4):
         after, rate = dyn.step(mine["q"], mine["qd"], mine["tau"], H)
