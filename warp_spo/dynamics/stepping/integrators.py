@@ -12,7 +12,7 @@ from ...execution.routine import PassForm, Routine, SegmentForm
 from ...kernels import combination, loops
 from ...kernels.substeps import SUBSTEPS
 from ...recursions import coordinates, kinematics
-from ...recursions.contact import pair_pieces, pairs
+from ...recursions.contact import coupled, pairs
 from ...recursions.loops import closed_step, multipliers
 from ...recursions.loops.closed_step import NEWTON_STEPS
 from ...recursions.step import hinge_forces
@@ -39,22 +39,13 @@ def _divides(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
     return recursion.by_segments(scene)
 
 
-def _limbs_couple(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
-    return pair_pieces.by_limbs(scene)
-
-
 STEP = Routine(
     "step", recursion.step, segments=SegmentForm(messages="PzaSX", divides=_divides, wide=True), passes=PassForm()
 )
 BODIES_BY_KINEMATICS = Routine(
     "body_states", kinematics.body_states, segments=SegmentForm(wide=True, body_kinematics=True), passes=PassForm()
 )
-PAIRED_STEP = Routine(
-    "paired_step",
-    pair_pieces.step,
-    segments=SegmentForm(messages="PzafSE", divides=_limbs_couple, wide=True, couples_bodies=True),
-    passes=PassForm(counted=True),
-)
+PAIRED_STEP = Routine("paired_step", coupled.step, passes=PassForm(counted=True))
 EMBEDDED_STEP = Routine("step", closed_step.step, passes=PassForm())
 STEP_UNDER_MULTIPLIERS = Routine("step", closed_step.step_with_multipliers, passes=PassForm())
 STEP_SYSTEM = Routine("step_system", closed_step.step_system)

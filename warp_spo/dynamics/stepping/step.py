@@ -211,7 +211,6 @@ def _step(
     contact_slip: AnyArray | None = None,
     contact_excess: AnyArray | None = None,
     contact_moment: AnyArray | None = None,
-    contact_residual: AnyArray | None = None,
     out: tuple[ArrayT | None, ArrayT | None] = (None, None),
 ) -> tuple[ArrayT, ArrayT]:
     """Launch a step. The arguments are those of :func:`step`, with options and reports by their own names."""
@@ -220,7 +219,7 @@ def _step(
         integrators.check_integrator(call, integrator, status=status, qdd=qdd)
         outs = engine.outs(call, STEP, out)
         substep_count = _take_substeps(call.name, {"substeps": substeps})
-        reported = contact_f, contact_gap, contact_slip, contact_excess, contact_moment, contact_residual
+        reported = contact_f, contact_gap, contact_slip, contact_excess, contact_moment
         report_arrays = dict(zip(contact_options.REPORTS, reported, strict=True))
         passes_made = contact_options.check_step(self, call, integrator, passes, report_arrays)
         actuators.check_commands(self, call, ctrl, actuator_state, target_q)
