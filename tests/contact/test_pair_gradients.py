@@ -255,7 +255,13 @@ def test_jax_differentiates_the_step():
     mine = tensors(dyn, {"q": q, **a})
     after, rate = dyn.step(mine["q"], mine["qd"], mine["tau"], H)
     wanted = torch.autograd.grad((after * after).sum() + (rate * rate).sum(), list(mine.values()))
+    heavy = spo.Dynamics(scene, WORLDS, "cpu", "float64", variable=("body_mass",))
     with jax.enable_x64(True):
+        by_mass = spo_jax.function(heavy, "step", dt=H, values=("body_mass",))
+        with pytest.raises(spo.UnsupportedError, match="gradients by arguments of the step, and of values by contact_"):
+            jax.grad(lambda mass: by_mass(q, a["qd"], a["tau"], body_mass=mass)[1].sum())(
+                np.tile(scene.values["body_mass"], (WORLDS, 1))
+            )
         step = spo_jax.function(dyn, "step", dt=H)
 
         def number(q, qd, tau):

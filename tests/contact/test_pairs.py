@@ -227,7 +227,6 @@ def test_couples_have_warps_of_their_own_where_worlds_are_few(monkeypatch):
 
 def test_calls_without_a_kernel_have_names(device):
     scene = stack((1.0, 1.0))
-    q, qd = scene.neutral_q[None].astype(np.float32), np.zeros((1, 12), np.float32)
     still = spo.Contact(2, sphere=0.1, other=spo.Contact(-1, sphere=0.1))  # neither of the two can move
     fixed = shelf(2).with_contacts([*shelf(2).contacts, still])
     at = shelf_states(0, 2)[0]  # such a pair is solved in joint space, whatever the granularity
