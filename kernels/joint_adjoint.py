@@ -309,7 +309,7 @@ for (int number = pass_count - 1; number >= 0; --number) {
         x_b[i] = v_b;
     }
     SYNC
-    // -- what the velocities of points do to the pass before; after the first one, to the rates before the step
+    // -- by the velocities of points: to the pass before; from the first one, to the rates before the step
     REAL *const to = first ? v0_b : x_b, *const by = first ? u0_b : u_b;
     LOOP
     for (int k = 0; k < runs; ++k) {
@@ -397,7 +397,7 @@ EACH (contact, stiffness_bar.shape[1]) {
     friction_bar.data[to] = by[2];
 }
 SYNC
-// -- gradients by what dofs move
+// -- gradients by the screws of dofs
 EACH (own, DOFS) {
     REAL by[SCREW] = {0, 0, 0, 0, 0, 0, 0, 0, 0};
     const REAL* const screw = screws.data + world * (SCREW * DOFS) + SCREW * own;

@@ -255,7 +255,13 @@ def test_jax_differentiates_the_step():
     mine = tensors(dyn, {"q": q, **a})
     after, rate = dyn.step(mine["q"], mine["qd"], mine["tau"], H)
     wanted = torch.autograd.grad((after * after).sum() + (rate * rate).sum(), list(mine.values()))
+    heavy = spo.Dynamics(scene, WORLDS, "cpu", "float64", variable=("body_mass",))
     with jax.enable_x64(True):
+        by_mass = spo_jax.function(heavy, "step", dt=H, values=("body_mass",))
+        with pytest.raises(spo.UnsupportedError, match="gradients by arguments of the step, and of values by contact_"):
+            jax.grad(lambda mass: by_mass(q, a["qd"], a["tau"], body_mass=mass)[1].sum())(
+                np.tile(scene.values["body_mass"], (WORLDS, 1))
+            )
         step = spo_jax.function(dyn, "step", dt=H)
 
         def number(q, qd, tau):
@@ -268,10 +274,11 @@ def test_jax_differentiates_the_step():
         np.testing.assert_array_equal(np.asarray(one), theirs.numpy())
 
 
-def test_the_way_back_is_prepared():
-    """A prepared gradient compiles nothing, and repeats what it launched."""
+def test_the_way_back_is_prepared_and_repeated():
+    """Calls that repeat what was launched have the bits of the first one."""
     scene, q, a = fingers("sphere", "slide")
     dyn = spo.Dynamics(scene, WORLDS, "cpu", "float64")
+    dyn.prepare("step_vjp", wrt=("q", "qd", "tau"))
     mine, found = tensors(dyn, {"q": q, **a}), []
     for _ in range(4):
         after, rate = dyn.step(mine["q"], mine["qd"], mine["tau"], H)

@@ -14,7 +14,7 @@ Contact with the ground:
     ``contact_cases``, ``contact_steps`` (the comparison with the dense step), ``contact_gradients``, ``hopping_leg``.
 Contact between bodies:
     ``pair_scenes``, ``hull_scenes``, ``pair_touches`` (their points), ``pair_steps`` (the comparison with the dense
-    step), ``pair_motions``.
+    step), ``pair_motions``, ``pair_gradients`` (beside differences).
 Flexible bodies:
     ``flexible_scenes``, ``flexible_trees``, ``flexible_twin`` (a second implementation).
 Newton's models and SolverSPO:

@@ -57,7 +57,7 @@ from .operation import Operation, find_operations
 from .refinement import Refinement
 from .stepping import contact_options
 from .stepping import step as steps
-from .stepping.joint_space import JointSpaceStep, choose_solver
+from .stepping.joint_space import NO_ROOM, JointSpaceStep, choose_solver
 from .stepping.joint_space_gradients import JointSpaceGradients
 
 MOST_WORLDS = 2**31 - 1  # of an axis of a Warp array
@@ -339,7 +339,10 @@ class Dynamics:
     @functools.cached_property
     def _joint_gradients(self) -> JointSpaceGradients:
         """The gradients of steps of scenes in which bodies touch."""
-        return JointSpaceGradients(self._joint_space or JointSpaceStep(self))
+        solver = self._joint_space or JointSpaceStep(self)
+        if not solver.fits:
+            raise UnsupportedError("Dynamics.step, backwards", NO_ROOM, "call inside torch.no_grad()")
+        return JointSpaceGradients(solver)
 
     @functools.cached_property
     def _later_status(self) -> wp.array:

@@ -12,6 +12,7 @@ from typing import Any
 
 import warp as wp
 
+from ...errors import UnsupportedError
 from ...execution.routine import Routine
 from ...kernels import combination, joint_adjoint, joint_space, near_pairs_adjoint
 from ...recursions.contact import joint_system
@@ -24,8 +25,8 @@ from .joint_space import JointSpaceStep
 SYSTEM = Routine("joint_system_vjp", derivatives.joint_system_vjp)
 STATE = Routine("joint_state_vjp", derivatives.joint_state_vjp)
 POWER = Routine("joint_power_vjp", derivatives.joint_power_vjp)
-LAWS = ("q", "qd", "tau", "target_q", "target_qd")  # what passes themselves have gradients by
-STATES = ("q", "qd")  # what a step begins with
+LAWS = ("q", "qd", "tau", "target_q", "target_qd")  # arguments that the passes read themselves
+STATES = ("q", "qd")  # the state before the step
 ACTING = ("body_f", "ctrl", "target_q", "target_qd")
 VALUES = ("contact_stiffness", "contact_damping", "contact_friction")
 """Values of a scene in which bodies touch by which steps have gradients."""
@@ -64,6 +65,9 @@ class JointSpaceGradients:
         ``given``: arguments of the step, "qdd" that it found, and the cotangents of its results.
         """
         solver = self.solver
+        if not set(results) <= {*LAWS, *ACTING, *VALUES}:
+            way = f"ask for gradients by arguments of the step, and of values by {', '.join(VALUES)}"
+            raise UnsupportedError("Dynamics.step, backwards", "another gradient where bodies touch each other", way)
         given = {name: value for name, value in given.items() if value is not None}
         q, qd, h, count = given["q"], given["qd"], given["dt"], PASSES if passes is None else int(passes)
         acting = {name: given.get(name) for name in ACTING}
@@ -80,7 +84,7 @@ class JointSpaceGradients:
         # the passes
         solved, gains, found = self._passes_back(given, states[joint_system.PASSED], h, count)
         self._points_back(h, found["touches"], found[derivatives.POSES])
-        # what they read of the state
+        # the system, which depends on the state
         inputs = {name: value for name, value in acting.items() if value is not None}
         if not solver.tables.sizes.laws:
             inputs = {name: value for name, value in inputs.items() if name == "body_f"}

@@ -129,7 +129,8 @@ def _lacking(links: Links) -> str:
 
 def _solve_in_joint_space(dyn: Dynamics) -> dict[str, Any]:
     """Return the option of a step that has a way back: bodies that touch are solved in joint space there."""
-    return {"joint_space": True} if dyn.scene.contact_pairs else {}
+    why = not dyn.scene.contact_pairs or reason_against_gradients(dyn.scene, dyn.variable)
+    return {} if why else {"joint_space": True}
 
 
 def _take_substeps(call: str, arguments: dict[str, Any]) -> int:
