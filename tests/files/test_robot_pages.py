@@ -222,6 +222,27 @@ def test_a_scene_by_hand_with_a_loop_stays_closed():
         page.close()
 
 
+def test_flexible_bodies_bend_to_the_bodies_that_they_carry():
+    """The line of a bent boom begins at its frame and ends where the jib begins, and so on to the load."""
+    from warp_spo.examples import crane
+
+    page = view(crane.scene(), port=18080)
+    try:
+        random = np.random.default_rng(0)
+        for handle in page.sliders.by_label.values():
+            handle.value = random.uniform(0.5 * handle.min, 0.5 * handle.max)
+        page.tick()
+        assert page.bent.bodies == [0, 1, 2]
+        for number, body in enumerate(page.bent.bodies):
+            line = page.bent.points(number, page.q, page.poses)
+            assert np.allclose(line[0], page.poses[body, :3]) and np.allclose(line[-1], page.poses[body + 1, :3])
+            assert np.linalg.norm(line[-1] - line[0]) > 5.0
+        sent = page.bent.handle.points
+        assert np.allclose(sent[-1, 1], page.poses[3, :3], atol=1e-5)  # float32, within 40 m
+    finally:
+        page.close()
+
+
 def test_two_pages_take_two_ports_of_this_machine(leg):
     _, page = leg
     other = view(spo.load(shipped("cartpole")), port=page.page.server.get_port())
