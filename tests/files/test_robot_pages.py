@@ -88,6 +88,18 @@ def test_what_a_file_draws_and_what_collides_are_apart(leg):
     assert np.allclose(sent_places(page, "collision shapes")[2][0], sent_places(page)[2][0])
 
 
+def test_a_file_without_a_ground_stands_on_one(tmp_path):
+    """Its feet touch the plane z = 0, and it falls onto it; without contact nothing would hold it."""
+    file = tmp_path / "leg.xml"
+    file.write_text("".join(line for line in LEG.splitlines() if 'type="plane"' not in line))
+    page = view(file, port=18080)
+    try:
+        assert len(page.scene.contact_points) > 0 and page.scene.ground.height == 0.0
+        assert any("no ground" in note for note in page.notes)
+    finally:
+        page.close()
+
+
 def test_overlays_show_points_frames_and_centres_of_mass(leg):
     _, page = leg
     page.back()

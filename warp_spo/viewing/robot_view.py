@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -372,7 +373,7 @@ def view(robot: Any, host: str = HOST, port: int = PORT, contacts: Any = None, *
 def load_with_notes(file: Path, contacts: Any, options: dict[str, Any]) -> tuple[Scene, list[str], bool]:
     """Return the scene of a file, the warnings of its loader, and whether its ground is one that somebody chose.
 
-    That of a URDF, which has none, is the plane z = 0, unless ``options`` have another.
+    A file without a ground, such as a URDF, gets the plane z = 0, unless ``options`` have another.
     """
     from ..newton import load
 
@@ -393,4 +394,9 @@ def load_with_notes(file: Path, contacts: Any, options: dict[str, Any]) -> tuple
         refusal = str(error)
         scene = read(None)
         return scene, [*notes, f"no contacts: {refusal}"], chosen
+    if scene.ground is None and "ground" not in options:
+        chosen, options = False, options | {"ground": Plane()}
+        wanted = contacts if contacts is not None else True if len(moving_trees(scene)) > 1 else "ground"
+        with contextlib.suppress(ValueError):  # of a shape that touches nothing
+            scene = read(wanted)
     return scene, notes, chosen
