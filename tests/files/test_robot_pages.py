@@ -88,6 +88,18 @@ def test_what_a_file_draws_and_what_collides_are_apart(leg):
     assert np.allclose(sent_places(page, "collision shapes")[2][0], sent_places(page)[2][0])
 
 
+def test_a_file_without_a_ground_stands_on_one(tmp_path):
+    """Its feet touch the plane z = 0, and it falls onto it; without contact nothing would hold it."""
+    file = tmp_path / "leg.xml"
+    file.write_text("".join(line for line in LEG.splitlines() if 'type="plane"' not in line))
+    page = view(file, port=18080)
+    try:
+        assert len(page.scene.contact_points) > 0 and page.scene.ground.height == 0.0
+        assert any("no ground" in note for note in page.notes)
+    finally:
+        page.close()
+
+
 def test_overlays_show_points_frames_and_centres_of_mass(leg):
     _, page = leg
     page.back()
@@ -218,6 +230,27 @@ def test_a_scene_by_hand_with_a_loop_stays_closed():
         page.tick()
         assert np.abs(page.q - before).max() > 0.05
         assert np.abs(page._kinematics.closure_error(page.q[None])).max() < 1e-6
+    finally:
+        page.close()
+
+
+def test_flexible_bodies_bend_to_the_bodies_that_they_carry():
+    """The line of a bent boom begins at its frame and ends where the jib begins, and so on to the load."""
+    from warp_spo.examples import crane
+
+    page = view(crane.scene(), port=18080)
+    try:
+        random = np.random.default_rng(0)
+        for handle in page.sliders.by_label.values():
+            handle.value = random.uniform(0.5 * handle.min, 0.5 * handle.max)
+        page.tick()
+        assert page.bent.bodies == [0, 1, 2]
+        for number, body in enumerate(page.bent.bodies):
+            line = page.bent.points(number, page.q, page.poses)
+            assert np.allclose(line[0], page.poses[body, :3]) and np.allclose(line[-1], page.poses[body + 1, :3])
+            assert np.linalg.norm(line[-1] - line[0]) > 5.0
+        sent = page.bent.handle.points
+        assert np.allclose(sent[-1, 1], page.poses[3, :3], atol=1e-5)  # float32, within 40 m
     finally:
         page.close()
 

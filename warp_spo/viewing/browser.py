@@ -20,7 +20,8 @@ HOST, PORT = "127.0.0.1", 8080
 SKY, SOIL, LINES = (236, 241, 246), (222, 226, 230), (204, 210, 216)  # colours of ground and of its lines
 FIELD = (0.80, 0.82, 0.84)  # colour of a height field
 SQUARE = 1.0  # edge of the ground's squares [m]
-GROUND_SIZE = 60.0  # edge of the part of a plane that is drawn [m]
+GROUND_SIZE = 60.0  # edge of the part of a plane that is drawn [m], below a robot of up to LARGE
+LARGE = 8.0  # from this size on the ground and its squares are ten times as large [m]
 MANY_FACES = 3000  # from which on a surface far away is drawn with fewer
 AZIMUTH, ELEVATION = -1.0, 0.32  # of the first camera, about the vertical from x, and above the horizontal [rad]
 BESIDE = 0.25  # by which what is looked at is left of the picture's middle, beside the panel: a share of its size
@@ -109,7 +110,7 @@ class Page:
             return
         self.root.position = (-x, -y, 0.0)
         if self._ground is not None and not self._fixed:
-            step = 2.0 * SQUARE
+            step = 2.0 * SQUARE * self._ground_scale
             self._ground.position = (step * round(x / step), step * round(y / step), self._level)
 
     def show_ground(self, ground: Plane | HeightField | None, which: int = 0) -> None:
@@ -117,6 +118,8 @@ class Page:
         if self._ground is not None:
             self._ground.remove()
         self._level, self._fixed, self._ground = 0.0, True, None
+        self._ground_scale = 10.0 if self.size > LARGE else 1.0
+        edge, square = GROUND_SIZE * self._ground_scale, SQUARE * self._ground_scale
         if ground is None:
             return
         if isinstance(ground, HeightField):
@@ -136,9 +139,9 @@ class Page:
         half = half / np.linalg.norm(half)  # half way from z to the normal: twice the turn about z x normal
         turn = (float(half[2]), float(-half[1]), float(half[0]), 0.0)
         self._ground = self.scene.add_grid(
-            f"{WORLD}/ground", GROUND_SIZE, GROUND_SIZE, cell_size=SQUARE, section_size=10.0 * SQUARE,
+            f"{WORLD}/ground", edge, edge, cell_size=square, section_size=10.0 * square,
             cell_color=LINES, section_color=LINES, cell_thickness=0.6, section_thickness=0.8, plane_color=SOIL,
-            plane_opacity=1.0, fade_distance=GROUND_SIZE, fade_strength=1.5, shadow_opacity=0.3,
+            plane_opacity=1.0, fade_distance=edge, fade_strength=1.5, shadow_opacity=0.3,
             position=(0.0, 0.0, self._level), wxyz=turn,
         )  # fmt: skip
 

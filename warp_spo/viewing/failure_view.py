@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 
 from ..dynamics.dynamics import Dynamics
+from ..errors import shown
 from ..scene.ground import Plane
 from ..status import Status
 from .appearance import Appearance, scene_appearance
 from .browser import HOST, PORT, BodyLayer, Page
+from .curves import table
 from .overlays import ORANGE, Arrows, point_places
 from .pose import extent, floats
 
@@ -56,7 +58,9 @@ class FailureView:
         self.plays = gui.add_checkbox("play", False)
         self.speed = gui.add_slider("speed", 0.05, 2.0, 0.05, 0.5)
         self.said = gui.add_markdown("")
-        gui.add_markdown("```text\n" + failure.describe() + "\n```")
+        head, *rows = failure.describe().splitlines()
+        head = head.partition(" ")[2]  # without the word "world"
+        gui.add_markdown(table(("world", shown(head)), [row.split(None, 1) for row in rows]))
         self._at, self._shown = float(failure.step), -1
         self.tick(0.0)
 
@@ -85,6 +89,10 @@ class FailureView:
         word = Status(int(failure.status[row])).name
         lost = "" if self._finite[row] else " The state before it is not finite; the last finite one is shown."
         self.said.content = f"Step {failure.first_step + row}, status {word}.{lost}"
+
+    def close(self) -> None:
+        """End the server."""
+        self.page.close()
 
     def run(self) -> None:
         """Show frames until Ctrl-C."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from ..scene.ground import Plane
 from ..scene.scene import Scene
 from ..status import Status
 from .appearance import Appearance, file_appearance, model_appearance, scene_appearance
+from .bent_bodies import BentBodies
 from .browser import HOST, PORT, WORLD, BodyLayer, Page
 from .curves import CurveChart
 from .motion import GROUNDS, Pull, RobotMotion, make_ground
@@ -85,6 +87,7 @@ class RobotView:
             "collision shapes": BodyLayer(self.page, "collision", appearance.collision, opacity=0.5, visible=False),
         }
         self.overlays = Overlays(self.page, scene, self.size)
+        self.bent = BentBodies(self.page, scene)
         self.arrows = Arrows(self.page, "forces", ORANGE, self.size)
         self._ground_name, self._own_ground = OWN, ground
         self.page.show_ground(ground)
@@ -112,6 +115,8 @@ class RobotView:
                     self.boxes[name] = gui.add_checkbox(name, layer.visible)
             for name in self.overlays.names:
                 self.boxes[name] = gui.add_checkbox(name, False)
+            if self.bent.handle is not None:
+                self.boxes["bent shapes"] = gui.add_checkbox("bent shapes", True)
             self.boxes["contact forces"] = gui.add_checkbox("contact forces", True)
             self.boxes["follow"] = gui.add_checkbox("follow the robot", len(moving_trees(self.scene)) == 1)
         with tabs.add_tab("Drop it"):
@@ -222,6 +227,9 @@ class RobotView:
         for name in self.overlays.names:
             if self.overlays.shown.get(name, False) != self.boxes[name].value:
                 self.overlays.show(name, self.boxes[name].value)
+        if self.bent.handle is not None and self.bent.handle.visible != self.boxes["bent shapes"].value:
+            self.bent.handle.visible = self.boxes["bent shapes"].value
+            self.bent.place(self.q, self.poses)
         self.arrows.visible = self.boxes["contact forces"].value
         if self.ground.value != self._ground_name and self.motion is not None:
             self._begin()
@@ -292,6 +300,7 @@ class RobotView:
         for layer in self.layers.values():
             layer.place(self.poses[None])
         self.overlays.place(self.poses)
+        self.bent.place(self.q, self.poses)
         if self.boxes["follow"].value and floats(self.scene) and self.motion is not None:
             self.page.follow(self.poses[0, :2] - self._home)
         elif self.motion is None:
@@ -364,7 +373,7 @@ def view(robot: Any, host: str = HOST, port: int = PORT, contacts: Any = None, *
 def load_with_notes(file: Path, contacts: Any, options: dict[str, Any]) -> tuple[Scene, list[str], bool]:
     """Return the scene of a file, the warnings of its loader, and whether its ground is one that somebody chose.
 
-    That of a URDF, which has none, is the plane z = 0, unless ``options`` have another.
+    A file without a ground, such as a URDF, gets the plane z = 0, unless ``options`` have another.
     """
     from ..newton import load
 
@@ -385,4 +394,9 @@ def load_with_notes(file: Path, contacts: Any, options: dict[str, Any]) -> tuple
         refusal = str(error)
         scene = read(None)
         return scene, [*notes, f"no contacts: {refusal}"], chosen
+    if scene.ground is None and "ground" not in options:
+        chosen, options = False, options | {"ground": Plane()}
+        wanted = contacts if contacts is not None else True if len(moving_trees(scene)) > 1 else "ground"
+        with contextlib.suppress(ValueError):  # of a shape that touches nothing
+            scene = read(wanted)
     return scene, notes, chosen

@@ -61,7 +61,7 @@ class JointSliders:
                         ends = (-0.1, 0.1)
                 value = rotation_vector(self.q[coords])[part] if part is not None else float(self.q[coords][0])
                 ends = min(ends[0], value), max(ends[1], value)
-                shown = label.rpartition("/")[2]
+                shown = label if dof + entry in deflections else label.rpartition("/")[2]
                 shown = f"{shown.rpartition(':')[0] or shown} {names[entry]}" if turns and entry < len(names) else shown
                 handle = gui.add_slider(
                     shown, min=float(ends[0]), max=float(ends[1]), step=float(max(ends[1] - ends[0], 1e-9) / STEPS),
