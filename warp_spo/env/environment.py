@@ -30,6 +30,7 @@ from .compile.cuda_graphs import Part, Replay, run_all
 from .compile.fused_kernel import Launch
 from .compile.guard import Guard
 from .compile.memory_layout import MemoryLayout
+from .compile.start_steps import StartSteps
 from .compile.step_kernels import Tracing
 from .curricula import ends_of
 from .episode_log import Log, describe, explain
@@ -158,12 +159,13 @@ class Env(VecEnv):
         self._networks = (
             ActuatorLaunches(self._learned, self._layout, store, decimation, device) if self._learned else None
         )
-        self.values, self._actuator_state = store.values, self._delay_buffers(events)
+        self.values, longest = store.values, self._longest_delay(events)
+        self._actuator_state = self.dyn.actuator_state(like=self.q, longest=longest) if longest else None
         self._log = Log(self._layout, self.reward_names, self.termination_names, self.device, worlds)
         points, seen = len(scene.contact_points), tracing.observed_entries
         of_pairs = any(array == "contact_gap" and entry >= points for array, entry in seen)
-        held = (self.q, self.qd, self._tensors["contact_gap"]) if of_pairs else ()
-        self._spare = tuple(map(torch.zeros_like, held))
+        moves = any(array == "frame_acceleration" for array, _ in seen)
+        self._start_steps = StartSteps(self, longest, of_pairs, moves)
         self._kernels = self._build(tracing)
         self._read_first, self._steps = tracing.stages["act"].read_arrays(), 0
         self._failures = None if keep_failures is None else FailureRing(self, keep_failures)
@@ -203,13 +205,11 @@ class Env(VecEnv):
         tables = {name: wp.to_torch(getattr(held, of_ground[name])) for name in of_ground.keys() & tracing.tables}
         return Storage(self._layout, self.num_envs, self.device, tracing.arrays, results, tracing.apart, tables)
 
-    def _delay_buffers(self, events: Sequence[Any]) -> Any:
-        """Return the buffers of actuators with delays, None where there are none."""
+    def _longest_delay(self, events: Sequence[Any]) -> int:
+        """Return the longest delay of actuators [steps of the dynamics], 0 where there are none."""
         delays = [int(each) for each in self.scene.values["actuator_delay"].ravel()]
         delays += [event.longest for event in events if isinstance(event, Delays)]
-        if "ctrl" not in self._controls or max(delays, default=0) == 0:
-            return None
-        return self.dyn.actuator_state(like=self.q, longest=max(delays))
+        return max(delays, default=0) if "ctrl" in self._controls else 0
 
     # -- numbers that may be written --------------------------------------------------------------------------------
     set_seed = seeding.set_seed
@@ -494,17 +494,8 @@ class Env(VecEnv):
             self._set_values()
         if self._actuator_state is not None:
             self.dyn.reset_actuator_state(self.chosen, self._actuator_state)
-        if self._spare:
-            self._measure_pairs()
+        self._start_steps.run()
         self._after("observe")
-
-    def _measure_pairs(self) -> None:
-        """Find the gaps of pairs of bodies where worlds have started anew, by a step that leads nowhere."""
-        q, qd, found = self._spare
-        report = StepReport(contact_gap=found)
-        self.dyn.step(self.q, self.qd, dt=self.dt, options=StepOptions(passes=1), report=report, out=(q, qd))
-        gap, points = self._tensors["contact_gap"], len(self.scene.contact_points)
-        gap[:, points:] = torch.where(self.chosen[:, None], found[:, points:], gap[:, points:])
 
     def _after(self, stage: str) -> None:
         """Compute what a stage reads of the new state."""

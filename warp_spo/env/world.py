@@ -381,10 +381,11 @@ class World:
     def imu(self, name: Any) -> Imu:
         """Return what an inertial measurement unit at a frame measures; ``name`` as :meth:`frame`.
 
-        The acceleration is that of the last step of the dynamics. A world that has just started anew is at rest.
+        The acceleration is that of the last step of the dynamics. In the first observation of an episode it is that of
+        a step from its state with the action 0, which nothing else sees.
         """
         frame, at = self.frame(name), self._layout.frame(name)
-        acceleration = self._quiet(vector(self._scalar("frame_acceleration", 6 * at + i) for i in range(3)))
+        acceleration = vector(self._scalar("frame_acceleration", 6 * at + i) for i in range(3))
         felt = acceleration - vector(as_scalar(x) for x in self.value("gravity"))
         turned = (rotate_back(frame.quaternion, v) for v in (felt, frame.angular_velocity))
         return Imu(*turned)

@@ -434,7 +434,12 @@ class Tracing:
         for name, (_, size, reset) in self.layout.memory.items():
             if reset is not None:
                 start.kept[name] = vector([reset] * size)
-        found = starts.reports(start, self.actions, self.observed_entries)
+        wanted = self.observed_entries
+        if any(array == "frame_acceleration" for array, _ in wanted):  # of a step with these controls
+            sizes = self.layout.control_sizes
+            acted = [name for name in starts.CONTROLS if name in self.layout.action_arrays]
+            wanted = wanted | {(name, entry) for name in acted for entry in range(sizes[name])}
+        found = starts.reports(start, self.actions, wanted)
         olds = [w._scalar(*key) for key in found]
         for key, value in zip(
             found, choose(done, [*map(AbstractScalar, found.values())], olds, "reports"), strict=True
