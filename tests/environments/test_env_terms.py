@@ -231,3 +231,27 @@ def test_exported_scales_are_those_below_the_effort_limit():
     assert gains["force_limit"] == [2.0]
     scale, offset, gains = export.controls_of(cart_env(2, actions=actions.Control(), scene=limited_cart()))
     assert (scale, offset, gains["force_limit"]) == (1.0, 0.0, [2.0])
+
+
+@pytest.mark.parametrize("when", ["start", "reset"])
+def test_values_that_are_written_count_for_terms_and_dynamics(when):
+    """Written by an index or whole, they act in the next step, as in dynamics of a scene that has them."""
+    env = cart_env(
+        3, scene=cart_scene(), rewards={}, terminations={}, observations={"a": [lambda w: w.value("joint_damping")[0]]},
+        events=[events.randomise("joint_damping", (1.0, 1.0), how="set", names="slide", when=when),
+                events.joints(velocity=(1.0, 1.0))],
+    )  # fmt: skip
+    for step, damping in enumerate((1.0, 8.0, 30.0)):
+        both = np.array([damping, 0.0 if step < 2 else damping])
+        if step == 1:
+            env.values["joint_damping"][1:, 0] = damping
+        elif step == 2:
+            env.values["joint_damping"] = torch.full((3, 2), damping)
+        twin = spo.Dynamics(env.scene.with_values(joint_damping=both), 3, "cpu", "float64")
+        q, qd = env.q.double().numpy().copy(), env.qd.double().numpy().copy()
+        twin.step(q, qd, dt=env.dt, options=spo.StepOptions(substeps=env.decimation), out=(q, qd))
+        observed, *_ = env.step(torch.zeros(3, env.num_actions))
+        assert observed["a"][2, 0] == damping
+        np.testing.assert_allclose(env.qd[2].numpy(), qd[2], rtol=1e-5)
+    env.reset()
+    assert env.values["joint_damping"][2, 0] == (1.0 if when == "reset" else 30.0)

@@ -575,7 +575,7 @@ def find_gap_of_boxes(q):
 
 def test_first_accelerations_are_those_of_the_new_state():
     """In free fall an accelerometer off the centre of mass feels the turn alone, omega x (omega x r), whatever came
-    before; in a box that comes to the ground it feels most of 9.81 m/s^2; a motor's action 0 is the offset of its action.
+    before. In a box that comes to the ground it feels most of 9.81 m/s^2. A motor's action 0 is the offset of its own.
     """
     body = spo.Body(2.0, inertia=0.1 * np.eye(3), label="body")
     free = spo.Hinge("free", -1, 0, label="root")

@@ -39,6 +39,7 @@ from .failures import FailureRing
 from .held_tensor import HeldTensor
 from .observations import TorchTerm
 from .validation import check_whole
+from .world_values import WorldValues
 
 try:
     from rsl_rl.env import VecEnv
@@ -88,7 +89,8 @@ class Env(VecEnv):
         q, qd: state, torch tensors [world, coordinate] and [world, dof].
         final: the argument ``final_observations``. bounds: those that end worlds.
         replay: runs a step without its inputs and results; ``replay.captured`` says of how many graphs it is made.
-        values: what events have made of the scene's values, torch tensors [world, ...] by name.
+        values: what events have made of the scene's values, torch tensors [world, ...] by name. What torch writes there
+            counts for terms and for the dynamics from the next step on, until an event draws the value anew.
         dyn: the :class:`Dynamics`. has_commands: whether it gives commands.
         action_labels, action_clips: of each action, what it sets, and None or the (lowest, highest) that counts.
         options: with which a task has changed its arguments, see ``settings.make_env``; {} without a task.
@@ -159,7 +161,7 @@ class Env(VecEnv):
         self._networks = (
             ActuatorLaunches(self._learned, self._layout, store, decimation, device) if self._learned else None
         )
-        self.values, longest = store.values, self._longest_delay(events)
+        self.values, longest = WorldValues(store.values), self._longest_delay(events)
         self._actuator_state = self.dyn.actuator_state(like=self.q, longest=longest) if longest else None
         self._log = Log(self._layout, self.reward_names, self.termination_names, self.device, worlds)
         points, seen = len(scene.contact_points), tracing.observed_entries
@@ -213,6 +215,11 @@ class Env(VecEnv):
 
     # -- numbers that may be written --------------------------------------------------------------------------------
     set_seed = seeding.set_seed
+
+    def take_written_values(self) -> None:
+        """Copy to the dynamics what has been written into ``values``; steps do so, but for a graph of many."""
+        if self.values.were_written():
+            self._set_values()
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
@@ -302,6 +309,7 @@ class Env(VecEnv):
             mask = arguments.check_mask("Env.reset", mask, self.num_envs, self.device)
             self.chosen.copy_(mask)
         before = self._store.out.clone()
+        self.take_written_values()
         self._launch("reset")
         self._after_reset()
         for part in self._user_parts("observe"):
@@ -327,6 +335,7 @@ class Env(VecEnv):
             ``time_outs`` [world], 1 where it ended for its length alone, and now and then ``log``.
         """
         self.actions.copy_(arguments.check_actions("Env.step", actions, self.num_envs, self.action_labels))
+        self.take_written_values()
         self.replay()
         self._steps += 1
         self.write_failures()
