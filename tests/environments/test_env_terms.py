@@ -6,7 +6,7 @@ import torch
 
 import warp_spo as spo
 from support.env_scenes import FEET, cart_env, cart_scene, walker_env, walker_q, walker_scene
-from warp_spo.env import Env, actions, commands, events, observations, rewards, terminations
+from warp_spo.env import Env, Observation, actions, commands, events, observations, rewards, terminations
 
 TERMS = {
     "track velocity": rewards.track_velocity(0.4),
@@ -255,3 +255,22 @@ def test_values_that_are_written_count_for_terms_and_dynamics(when):
         np.testing.assert_allclose(env.qd[2].numpy(), qd[2], rtol=1e-5)
     env.reset()
     assert env.values["joint_damping"][2, 0] == (1.0 if when == "reset" else 30.0)
+
+
+def test_constants_beyond_float32_are_infinite():
+    """As NumPy's float32 has them; a number that reaches a learner ends its world, counted by the term's name."""
+    terms = [
+        Observation(lambda w: spo.where(w.q[0] > 0.0, 1e40, -w.q[0]), clip=(-2.0, 2.0)),
+        Observation(lambda w: np.arctan2(1.0, -1e40 * w.q[1]), clip=(-9.0, 9.0)),
+        lambda w: 1.0 / (spo.where(w.q[1] > 0.0, -3.5e38, 1e300)),
+    ]
+    env = cart_env(16, observations={"a": terms}, rewards={"huge": (1.0, lambda w: 3.5e38)}, terminations={})
+    q = env.q.numpy()
+    with np.errstate(over="ignore"):
+        huge = np.float32(1e40)
+        wanted = [np.clip(np.where(q[:, 0] > 0.0, huge, -q[:, 0]), -2, 2), np.arctan2(np.float32(1), -huge * q[:, 1])]
+    observed = env.get_observations()["a"].numpy()
+    np.testing.assert_allclose(observed.T, [*wanted, np.zeros(16)], rtol=1e-6)
+    assert env.step(torch.zeros(16, 1))[2].all()
+    (name,) = (name for name, count in env.log().items() if "reward/huge" in name and float(count))
+    assert "not finite" in name or "beyond" in name
