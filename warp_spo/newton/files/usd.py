@@ -13,7 +13,7 @@ import numpy as np
 from newton.usd import SchemaResolverNewton
 
 from ...errors import UnsupportedError, shown
-from ...execution.joint_tables import why_few_pairs
+from ...execution.joint_tables import why_unsolved
 from ...scene.collision_shapes import NONE, CollisionShape, ShapeSelection
 from ...scene.contacts import Contact
 from ...scene.scene import Scene
@@ -268,7 +268,7 @@ def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool, selection: 
         return shapes().touches(shape, ground)
 
     def pairs() -> PairSelection:
-        return select_pairs(call, shapes(), scene, takes_still=True, why_few=why_few_pairs)
+        return select_pairs(call, shapes(), scene, takes_still=True, why_unsolved=why_unsolved)
 
     scene, lost = selection.apply(
         call, scene, lambda: shapes().first(), touches, CollisionShape.with_mean_material, pairs=pairs
