@@ -6,6 +6,7 @@ force and clocks stand at zero. Over further steps, clocks of feet and waits of 
 planted is found by the name of what it spoils.
 """
 
+import functools
 import inspect
 
 import numpy as np
@@ -22,6 +23,7 @@ FEET, PAIRS = "leg.", ((0, 1), (1, 0))
 PLACE = (0.3, 0.2)  # where a term asks for the height of the ground [m]
 TABLE = np.arange(8.0).reshape(4, 2) ** 2
 FLOAT32 = 3e-5  # of numbers of a size: gaps of bodies 1 m away, drives of 50 N m/rad at rounded angles
+DT = 5e-3  # of the environment's steps of the dynamics [s]
 STEPS = 55  # one more than a period of one second and a few
 LOW, SHARE, WIDE = -1.2, 0.5, 0.4  # lower limits [rad], share of joint_limits, deviation of posture
 
@@ -42,6 +44,12 @@ def scene():
     )
 
 
+@functools.cache
+def stepper(variable):
+    """Return the dynamics of one world in float64, with values that may be set."""
+    return spo.Dynamics(scene(), 1, "cpu", "float64", variable=variable)
+
+
 # -- what is observed, and the truth -----------------------------------------------------------------------------------
 class Truth:
     """One world of an environment in which an episode starts.
@@ -57,6 +65,7 @@ class Truth:
         self.bias, self.drawn = row(env.memory("encoder bias")), row(env.memory("drawn"))
         self.asked, self.moves = row(env.memory("command heading"))
         self.own = env.scene.with_values(**{name: row(values) for name, values in env.values.items()})
+        self.variable = tuple(sorted(env.values))
         self.dense, self.default = Dense(self.own, self.q, self.qd), env.default_q
         self.turn = self.dense.body_matrix[0][:3, :3]
         self.ground = self.value("ground_origin")[2]
@@ -103,10 +112,27 @@ class Truth:
         return np.arctan2(self.turn[1, 0], self.turn[0, 0])
 
     @property
+    def ctrl(self):
+        """Of the action 0: the servo's length goes to the default, less what its encoder adds."""
+        return np.array([self.value("actuator_gear")[0] * (self.default[7] - self.bias[0])])
+
+    @property
+    def felt(self):
+        """Acceleration of the trunk's origin less gravity in its axes, over a step of float64 with the action 0."""
+        target = self.default.copy()
+        target[7:] -= self.bias
+        dyn, report = stepper(self.variable), spo.StepReport(qdd=np.zeros((1, 8)))
+        dyn.set(**{name: self.value(name)[None] for name in self.variable})
+        dyn.step(self.q[None], self.qd[None], dt=DT, ctrl=self.ctrl[None], target_q=target[None], report=report)
+        ((*a, _, _),) = report.qdd
+        offset, rate = self.turn @ self.value("body_com")[0], self.qd[3:6]  # qd is of the centre of mass
+        a = a[:3] - np.cross(a[3:], offset) - np.cross(rate, np.cross(rate, offset))
+        return self.turn.T @ (a - self.value("gravity"))
+
+    @property
     def force(self):
         """Of the action 0: the servo's length and the drive's angle go to the default, less what encoders add."""
-        gear = self.value("actuator_gear")[0]
-        total = self.dense.actuator_force(self.qd, np.array([gear * (self.default[7] - self.bias[0])]))
+        total = self.dense.actuator_force(self.qd, self.ctrl)
         ke, kd, most = (self.value(f"joint_{name}")[7] for name in ("target_ke", "target_kd", "effort_limit"))
         total[7] += np.clip(ke * (self.default[8] - self.bias[1] - self.q[8]) - kd * self.qd[7], -most, most)
         return total
@@ -205,7 +231,7 @@ ATTRIBUTES = {
     "jacobian": (lambda w: w.jacobian("leg1").ravel(), lambda t: t.dense.jacobian([2])[0].ravel()),
     "imu": (
         lambda w: [*w.imu("trunk").acceleration, *w.imu("trunk").rate],
-        lambda t: [*(t.turn.T @ -t.value("gravity")), *t.rates[1]],
+        lambda t: [*t.felt, *t.rates[1]],
     ),
     "value": (lambda w: w.value("body_com")[0], lambda t: t.value("body_com")[0]),
     "memory": (lambda w: w.memory("place", 1), lambda t: t.q[2]),
@@ -241,7 +267,7 @@ READY = {
     observations.feet_height: (observations.feet_height(FEET), lambda t: t.gap[:2]),
     observations.height_scan: (
         observations.height_scan((0.2, 0.2), 0.1, 0.3), lambda t: np.full(9, t.q[2] - 0.3 - t.ground)),
-    observations.accelerometer: (observations.accelerometer("trunk"), lambda t: t.turn.T @ -t.value("gravity")),
+    observations.accelerometer: (observations.accelerometer("trunk"), lambda t: t.felt),
     observations.gyro: (observations.gyro("leg1"), lambda t: t.frame(2)[0][:3, :3].T @ t.frame(2)[2]),
     rays.lidar: (rays.lidar([(0.0, 0.0, -1.0)]), ray_truth),
     rewards.alive: lambda t: 1.0,

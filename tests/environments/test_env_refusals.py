@@ -139,7 +139,10 @@ RETURNED = [
     (dict(commands=UPDATED[0]), "Env: commands.update returned None; expected one number"),
     (dict(commands=UPDATED[1]), r"Env: commands.update returned an array of shape \(3,\); expected one number"),
     (dict(metrics={"m": returns(None)}), "Env: metric 'm' returned None; expected one number"),
-    (dict(events=[events.Start(keeps("m", 1, None))]), r"Env: World.keep\('m'\) was given None; expected one number"),
+    (
+        dict(events=[events.Start(keeps("m", 1, None))]),
+        r"Env: events\[0\]: World.keep\('m'\) was given None; expected one number",
+    ),
     (
         dict(actions=Setting(scale=[(7, 1.0)])),
         "actions.Setting.trace: an entry of tau is 7; expected an integer, 0 to 1",
@@ -152,6 +155,33 @@ RETURNED = [
 def test_what_came_of_a_function_is_named(changes, words):
     with pytest.raises((ValueError, TypeError), match=words):
         cart_env(**changes)
+
+
+WRONG = [
+    (lambda w: w.q[5], "index 5 is out of bounds"),
+    (lambda w: w.q[0] % 1.0, "%, // or divmod does not take an abstract scalar; expected"),
+    (lambda w: 7 // w.q[0], "%, // or divmod does not take"),
+    (lambda w: round(w.q[0]), "round, math.floor, ceil or trunc does not take"),
+    (lambda w: w.phase(0), "World.phase: period is 0; expected a finite number above zero"),
+    (lambda w: w.phase(-1.0), "World.phase: period is -1.0; expected"),
+    (lambda w: w.phase(NAN), "World.phase: period is nan; expected"),
+    (lambda w: w.contact_gap, "a term reads contacts, and the scene has none"),
+]
+
+
+@pytest.mark.parametrize(("term", "words"), WRONG)
+def test_errors_inside_of_terms_name_the_term(term, words):
+    groups = {"actor": [lambda w: w.q, term]}
+    changes = dict(
+        observations=(groups, r"the observation 'unnamed' \(test_env_refusals.py, line \d+\)"),
+        rewards=({"up": (1.0, term)}, "reward 'up'"),
+        terminations=({"out": term}, "termination 'out'"),
+        metrics=({"m": term}, "metric 'm'"),
+        events=([events.Start(lambda w: w.keep("m", [term(w)]))], r"events\[0\]"),
+    )
+    for name, (given, place) in changes.items():
+        with pytest.raises((IndexError, TypeError, ValueError), match=f"^Env: {place}: {words}"):
+            cart_env(**{name: given})
 
 
 def test_comparisons_and_integers_are_numbers_in_observations_and_rewards():
@@ -273,6 +303,8 @@ def test_calls_name_what_is_wrong():
     for actions_, words in (
         (None, "NoneType; expected a tensor"),
         (torch.zeros(8, 1) * 1j, "complex numbers of shape"),
+        (torch.zeros(8, 1, device="meta"), "on the device meta, without numbers; expected a dense tensor"),
+        (torch.zeros(8, 1).to_sparse(), "of layout torch.sparse_coo; expected a dense tensor"),
     ):
         with pytest.raises((ValueError, TypeError), match=f"Env.step: actions .*{words}"):
             env.step(actions_)

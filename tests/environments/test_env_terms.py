@@ -6,7 +6,7 @@ import torch
 
 import warp_spo as spo
 from support.env_scenes import FEET, cart_env, cart_scene, walker_env, walker_q, walker_scene
-from warp_spo.env import Env, actions, commands, events, observations, rewards, terminations
+from warp_spo.env import Env, Observation, actions, commands, events, observations, rewards, terminations
 
 TERMS = {
     "track velocity": rewards.track_velocity(0.4),
@@ -231,3 +231,46 @@ def test_exported_scales_are_those_below_the_effort_limit():
     assert gains["force_limit"] == [2.0]
     scale, offset, gains = export.controls_of(cart_env(2, actions=actions.Control(), scene=limited_cart()))
     assert (scale, offset, gains["force_limit"]) == (1.0, 0.0, [2.0])
+
+
+@pytest.mark.parametrize("when", ["start", "reset"])
+def test_values_that_are_written_count_for_terms_and_dynamics(when):
+    """Written by an index or whole, they act in the next step, as in dynamics of a scene that has them."""
+    env = cart_env(
+        3, scene=cart_scene(), rewards={}, terminations={}, observations={"a": [lambda w: w.value("joint_damping")[0]]},
+        events=[events.randomise("joint_damping", (1.0, 1.0), how="set", names="slide", when=when),
+                events.joints(velocity=(1.0, 1.0))],
+    )  # fmt: skip
+    for step, damping in enumerate((1.0, 8.0, 30.0)):
+        both = np.array([damping, 0.0 if step < 2 else damping])
+        if step == 1:
+            env.values["joint_damping"][1:, 0] = damping
+        elif step == 2:
+            env.values["joint_damping"] = torch.full((3, 2), damping)
+        twin = spo.Dynamics(env.scene.with_values(joint_damping=both), 3, "cpu", "float64")
+        q, qd = env.q.double().numpy().copy(), env.qd.double().numpy().copy()
+        twin.step(q, qd, dt=env.dt, options=spo.StepOptions(substeps=env.decimation), out=(q, qd))
+        observed, *_ = env.step(torch.zeros(3, env.num_actions))
+        assert observed["a"][2, 0] == damping
+        np.testing.assert_allclose(env.qd[2].numpy(), qd[2], rtol=1e-5)
+    env.reset()
+    assert env.values["joint_damping"][2, 0] == (1.0 if when == "reset" else 30.0)
+
+
+def test_constants_beyond_float32_are_infinite():
+    """As NumPy's float32 has them; a number that reaches a learner ends its world, counted by the term's name."""
+    terms = [
+        Observation(lambda w: spo.where(w.q[0] > 0.0, 1e40, -w.q[0]), clip=(-2.0, 2.0)),
+        Observation(lambda w: np.arctan2(1.0, -1e40 * w.q[1]), clip=(-9.0, 9.0)),
+        lambda w: 1.0 / (spo.where(w.q[1] > 0.0, -3.5e38, 1e300)),
+    ]
+    env = cart_env(16, observations={"a": terms}, rewards={"huge": (1.0, lambda w: 3.5e38)}, terminations={})
+    q = env.q.numpy()
+    with np.errstate(over="ignore"):
+        huge = np.float32(1e40)
+        wanted = [np.clip(np.where(q[:, 0] > 0.0, huge, -q[:, 0]), -2, 2), np.arctan2(np.float32(1), -huge * q[:, 1])]
+    observed = env.get_observations()["a"].numpy()
+    np.testing.assert_allclose(observed.T, [*wanted, np.zeros(16)], rtol=1e-6)
+    assert env.step(torch.zeros(16, 1))[2].all()
+    (name,) = (name for name, count in env.log().items() if "reward/huge" in name and float(count))
+    assert "not finite" in name or "beyond" in name

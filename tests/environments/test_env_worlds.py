@@ -573,6 +573,34 @@ def find_gap_of_boxes(q):
     return q[:, 1] - q[:, 0] - 0.2
 
 
+def test_first_accelerations_are_those_of_the_new_state():
+    """In free fall an accelerometer off the centre of mass feels the turn alone, omega x (omega x r), whatever came
+    before. In a box that comes to the ground it feels most of 9.81 m/s^2. A motor's action 0 is the offset of its own.
+    """
+    body = spo.Body(2.0, inertia=0.1 * np.eye(3), label="body")
+    free = spo.Hinge("free", -1, 0, label="root")
+    sites = {"imu": (0, (0.1, 0.0, 0.2, 0.0, 0.0, 0.0, 1.0))}
+    common = dict(worlds=2, device="cpu", rewards={}, observations={"a": [lambda w: w.imu("imu").acceleration]})
+    rim = spo.Body(0.5, inertia=0.01 * np.eye(3), label="rim")
+    spun = spo.Scene([body, rim], [free, spo.Hinge("revolute", -1, 1, axis=(0, 1, 0), label="spin")], sites=sites)
+    turns = events.base(angular_velocity=(2.0, 2.0), z=(5.0, 5.0))
+    env = envs.Env(spun, actions=actions.Effort("spin"), events=[turns], **common)
+    omega = env.qd[0, 3:6].double().numpy()
+    felt = np.cross(omega, np.cross(omega, sites["imu"][1][:3]))
+    for observed in (env.get_observations(), env.reset(torch.tensor([True, False]))[0], env.reset()[0]):
+        np.testing.assert_allclose(observed["a"][0].numpy(), felt, rtol=1e-5)
+        env.step(torch.ones(2, 1))
+    standing = spo.Scene([body, rim], spun.hinges, sites=sites, contacts=[spo.Contact(0, box=((0.2, 0.2, 0.1)))])
+    env = envs.Env(standing, actions=actions.Effort("spin"), default_q=[0, 0, 0.1, 0, 0, 0, 1, 0], **common)
+    np.testing.assert_allclose(env.get_observations()["a"][0].numpy(), [0, 0, 9.81], atol=1.5)  # a step of 5 ms
+    thrust = spo.Actuator(0, gain=40.0, delay=1, label="thrust")
+    lifted = spo.Scene(
+        [body], [spo.Hinge("prismatic", -1, 0, axis=(0, 0, 1), label="lift")], sites=sites, actuators=[thrust]
+    )
+    env = envs.Env(lifted, actions=actions.Control(offset=1.0), **common)  # a delay begins with the first control
+    np.testing.assert_allclose(env.get_observations()["a"][0].numpy(), [0, 0, 20.0], rtol=1e-5)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["go2-flat", "go2-rough", "g1-flat"])
 def test_first_gaps_of_the_tasks_are_those_of_a_step_from_there(task):

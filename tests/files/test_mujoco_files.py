@@ -153,6 +153,19 @@ def test_the_humanoid_whose_sensors_mujoco_refuses():
     assert scene.body_labels[:3] == ["torso", "lower_waist", "pelvis"]
 
 
+def test_a_missing_include_and_names_in_another_encoding(tmp_path):
+    """No <inertial> helps a missing <include>; MuJoCo takes the bytes of every file for UTF-8."""
+    with pytest.raises(ValueError, match=r"'no.xml' Element 'include'.*correct the file, or put that file there$"):
+        spo.load(written(tmp_path, before='<include file="no.xml"/>'))
+    text = '<?xml version="1.0" encoding="latin-1"?>' + FILE.format(**EMPTY | {"world": BODY.format(**BODIES)})
+    for kind, name in (("body 1", '"b"'), ("joint 0", '"j"')):
+        (tmp_path / "old.xml").write_bytes(text.replace(name, '"\xe9"').encode("latin-1"))
+        with pytest.raises(
+            ValueError, match=rf"old.xml' with the name of {kind}, which is not UTF-8,.*save the file as UTF-8"
+        ):
+            spo.load(tmp_path / "old.xml")
+
+
 def test_files_that_are_no_mjcf(tmp_path):
     file = tmp_path / "robot.xml"
     for text, words in (

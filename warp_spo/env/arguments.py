@@ -131,6 +131,7 @@ def check_actions(call: str, actions: Any, worlds: int, labels: list[str]) -> to
         tensor = torch.as_tensor(actions)
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"{call}: actions is {type(actions).__name__}; expected a tensor or an array") from None
+    refuse_without_numbers(call, "actions", tensor)
     if tuple(tensor.shape) != (worlds, len(labels)) or tensor.is_complex():
         kind = "complex numbers of " if tensor.is_complex() else ""
         raise ValueError(
@@ -143,6 +144,13 @@ def check_actions(call: str, actions: Any, worlds: int, labels: list[str]) -> to
             "gradient; call it inside torch.no_grad(), or pass actions.detach(); Dynamics.step has gradients"
         )
     return tensor
+
+
+def refuse_without_numbers(call: str, name: str, tensor: torch.Tensor) -> None:
+    """Raise ValueError for a tensor of the device "meta", or one that is not dense."""
+    kind = "on the device meta, without numbers" if tensor.is_meta else f"of layout {tensor.layout}"
+    if tensor.is_meta or tensor.layout != torch.strided:
+        raise ValueError(f"{call}: {name} is {kind}; expected a dense tensor or an array")
 
 
 def check_mask(call: str, mask: Any, worlds: int, device: torch.device) -> torch.Tensor:

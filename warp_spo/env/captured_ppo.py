@@ -106,6 +106,8 @@ class CapturedPPO(PPO):
                 self._roll_out()
                 return self._seen
             replays = self._collecting.is_graph
+            if replays:
+                env.take_written_values()
             self._collecting()
             if replays:
                 env._steps += self.storage.num_transitions_per_env

@@ -30,6 +30,7 @@ from .compile.cuda_graphs import Part, Replay, run_all
 from .compile.fused_kernel import Launch
 from .compile.guard import Guard
 from .compile.memory_layout import MemoryLayout
+from .compile.start_steps import StartSteps
 from .compile.step_kernels import Tracing
 from .curricula import ends_of
 from .episode_log import Log, describe, explain
@@ -38,6 +39,7 @@ from .failures import FailureRing
 from .held_tensor import HeldTensor
 from .observations import TorchTerm
 from .validation import check_whole
+from .world_values import WorldValues
 
 try:
     from rsl_rl.env import VecEnv
@@ -87,7 +89,8 @@ class Env(VecEnv):
         q, qd: state, torch tensors [world, coordinate] and [world, dof].
         final: the argument ``final_observations``. bounds: those that end worlds.
         replay: runs a step without its inputs and results; ``replay.captured`` says of how many graphs it is made.
-        values: what events have made of the scene's values, torch tensors [world, ...] by name.
+        values: what events have made of the scene's values, torch tensors [world, ...] by name. What torch writes there
+            counts for terms and for the dynamics from the next step on, until an event draws the value anew.
         dyn: the :class:`Dynamics`. has_commands: whether it gives commands.
         action_labels, action_clips: of each action, what it sets, and None or the (lowest, highest) that counts.
         options: with which a task has changed its arguments, see ``settings.make_env``; {} without a task.
@@ -152,15 +155,16 @@ class Env(VecEnv):
         store = self._store = self._allocate(tracing)
         self.q, self.qd, self.actions, self.chosen = (store.tensors[n] for n in ("q", "qd", "actions", "chosen"))
         self._tensors, self._controls, self._report = store.tensors, store.controls, StepReport(**store.written)
-        self.values, self._actuator_state = store.values, self._delay_buffers(events)
+        self.values, longest = WorldValues(store.values), self._longest_delay(events)
+        self._actuator_state = self.dyn.actuator_state(like=self.q, longest=longest) if longest else None
         self._networks = self._actuator_launches()  # None: the kernel of the step evaluates networks, or there are none
         substeps = self.decimation if self._networks is None else 1
         self._step_options = StepOptions(substeps=substeps, passes=self._passes)
         self._log = Log(self._layout, self.reward_names, self.termination_names, self.device, worlds)
         points, seen = len(scene.contact_points), tracing.observed_entries
         of_pairs = any(array == "contact_gap" and entry >= points for array, entry in seen)
-        held = (self.q, self.qd, self._tensors["contact_gap"]) if of_pairs else ()
-        self._spare = tuple(map(torch.zeros_like, held))
+        moves = any(array == "frame_acceleration" for array, _ in seen)
+        self._start_steps = StartSteps(self, longest, of_pairs, moves)
         self._kernels = self._build(tracing)
         self._read_first, self._steps = tracing.stages["act"].read_arrays(), 0
         self._failures = None if keep_failures is None else FailureRing(self, keep_failures)
@@ -208,16 +212,19 @@ class Env(VecEnv):
         given = "ctrl" in self._controls, self._actuator_state is not None, self._passes
         return None if found.join(self.dyn, *given) else found
 
-    def _delay_buffers(self, events: Sequence[Any]) -> Any:
-        """Return the buffers of actuators with delays, None where there are none."""
+    def _longest_delay(self, events: Sequence[Any]) -> int:
+        """Return the longest delay of actuators [steps of the dynamics], 0 where there are none."""
         delays = [int(each) for each in self.scene.values["actuator_delay"].ravel()]
         delays += [event.longest for event in events if isinstance(event, Delays)]
-        if "ctrl" not in self._controls or max(delays, default=0) == 0:
-            return None
-        return self.dyn.actuator_state(like=self.q, longest=max(delays))
+        return max(delays, default=0) if "ctrl" in self._controls else 0
 
     # -- numbers that may be written --------------------------------------------------------------------------------
     set_seed = seeding.set_seed
+
+    def take_written_values(self) -> None:
+        """Copy to the dynamics what has been written into ``values``; steps do so, but for a graph of many."""
+        if self.values.were_written():
+            self._set_values()
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
@@ -307,6 +314,7 @@ class Env(VecEnv):
             mask = arguments.check_mask("Env.reset", mask, self.num_envs, self.device)
             self.chosen.copy_(mask)
         before = self._store.out.clone()
+        self.take_written_values()
         self._launch("reset")
         self._after_reset()
         for part in self._user_parts("observe"):
@@ -332,6 +340,7 @@ class Env(VecEnv):
             ``time_outs`` [world], 1 where it ended for its length alone, and now and then ``log``.
         """
         self.actions.copy_(arguments.check_actions("Env.step", actions, self.num_envs, self.action_labels))
+        self.take_written_values()
         self.replay()
         self._steps += 1
         self.write_failures()
@@ -499,17 +508,8 @@ class Env(VecEnv):
             self._set_values()
         if self._actuator_state is not None:
             self.dyn.reset_actuator_state(self.chosen, self._actuator_state)
-        if self._spare:
-            self._measure_pairs()
+        self._start_steps.run()
         self._after("observe")
-
-    def _measure_pairs(self) -> None:
-        """Find the gaps of pairs of bodies where worlds have started anew, by a step that leads nowhere."""
-        q, qd, found = self._spare
-        report = StepReport(contact_gap=found)
-        self.dyn.step(self.q, self.qd, dt=self.dt, options=StepOptions(passes=1), report=report, out=(q, qd))
-        gap, points = self._tensors["contact_gap"], len(self.scene.contact_points)
-        gap[:, points:] = torch.where(self.chosen[:, None], found[:, points:], gap[:, points:])
 
     def _after(self, stage: str) -> None:
         """Compute what a stage reads of the new state."""

@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import shown
 from ..trace.functions import clip, where
 from .compile.fused_kernel import ROW_NUMBER
-from .compile.returned import numbers, one_number
+from .compile.returned import naming, numbers, one_number
 from .compile.vectors import Vector, rotate, rotate_back, vector
 from .validation import check_function, check_number, check_optional_span, check_steps, check_whole
 from .world import World
@@ -57,6 +57,8 @@ class Each:
 class Observation:
     """A term with what is done to its numbers: bias and noise are added, the sum is scaled and clipped, then it waits.
 
+    Groups that list the same observation see the same numbers.
+
     Args:
         term: function of a ``World`` that returns a number or an array of numbers.
         scale: factor.
@@ -88,12 +90,9 @@ class Observation:
 
     def trace(self, w: World, admit: Callable[[Vector], Vector] = lambda values: values) -> Vector:
         """Return the numbers; ``admit`` returns of what is measured what may be seen and remembered."""
-        values = numbers(f"the observation {place_of(self)} returned", self.term(w))
-        if self.bias > 0.0:
-            values = values + w.drawn(
-                f"bias {w.number(self)}", len(values), lambda s: [s.uniform(-self.bias, self.bias) for _ in values]
-            )
-        values = admit(vector(self._measurement(w, x) for x in values))
+        if self not in w.measured:
+            w.measured[self] = self._measure(w)
+        values = admit(w.measured[self])
         least, most = check_steps("Observation", "delay", self.delay)
         if self.history + most == 1:
             return values
@@ -112,6 +111,19 @@ class Observation:
             ]
         return vector(x for row in chosen for x in row)
 
+    def _measure(self, w: World) -> Vector:
+        """Return the numbers with bias and noise, scaled and clipped.
+
+        An observation that stands in several groups is measured once in a step: they see the same noise.
+        """
+        with naming(f"the observation {place_of(self)}"):
+            values = numbers(f"the observation {place_of(self)} returned", self.term(w))
+        if self.bias > 0.0:
+            values = values + w.drawn(
+                f"bias {w.number(self)}", len(values), lambda s: [s.uniform(-self.bias, self.bias) for _ in values]
+            )
+        return vector(self._measurement(w, x) for x in values)
+
     def truth(self) -> Observation:
         """Return the observation without noise, bias and delay, as a critic sees it; scale, clip and history stay."""
         return dataclasses.replace(self, noise=0.0, bias=0.0, delay=0)
@@ -124,9 +136,12 @@ class Observation:
 
     def trace_row(self, w: World, number: int) -> Any:
         """Return the number of a row of the thread."""
-        returned = self.term.of_own_row(w, number)  # type: ignore[attr-defined]
-        found = one_number(f"the observation {place_of(self)} returned for a row", returned)
-        value = self._measurement(w, found)
+        if (self, number) in w.measured:
+            return w.measured[self, number]
+        with naming(f"the observation {place_of(self)}"):
+            returned = self.term.of_own_row(w, number)  # type: ignore[attr-defined]
+            found = one_number(f"the observation {place_of(self)} returned for a row", returned)
+        value = w.measured[self, number] = self._measurement(w, found)
         if w.kept:
             function = self.term.function  # type: ignore[attr-defined]
             kept = ", ".join(map(shown, w.kept))
@@ -140,10 +155,7 @@ class Observation:
         return x if self.clip is None else clip(x, *self.clip)
 
     def _remember(self, w: World, values: Vector, count: int) -> list[Vector]:
-        """Return the numbers of ``count`` steps, the newest first, and keep them.
-
-        An observation that stands in several groups is measured once in a step.
-        """
+        """Return the numbers of ``count`` steps, the newest first, and keep them; in several groups, once."""
         size, name = len(values), f"history {w.number(self)}"
         if name in w.measured:
             return w.measured[name]

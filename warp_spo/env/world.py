@@ -21,6 +21,7 @@ from .compile.returned import numbers
 from .compile.vectors import Vector, as_scalar, as_value, cross, find, rotate, rotate_back, vector
 from .curricula import Curriculum, remembered_mean
 from .feet import Feet, feet
+from .validation import check_number, check_positive
 
 if TYPE_CHECKING:
     from ..trace.functions import Condition
@@ -82,7 +83,8 @@ class World:
         self.scene = layout.scene
         self.dt = layout.step_dt
         self.kept: dict[str, Vector] = {}
-        self.measured: dict[str, list[Vector]] = {}  # what observations with a history see, the newest first
+        # Numbers of observations, and by name what those with a history see, the newest first.
+        self.measured: dict[Any, Any] = {}
         self.values: dict[str, np.ndarray] = {}
         self.present: dict[str, np.ndarray] = {}  # values of the scene that this stage has changed
         self.lasting = False  # whether what it keeps stays when an episode starts
@@ -124,10 +126,11 @@ class World:
 
     def whole_steps(self, seconds: float) -> float:
         """Return a time [s] in steps of the environment, a number; whole where it is so but for rounding."""
-        return self._layout.whole_steps(seconds)
+        return self._layout.whole_steps(check_number("World.whole_steps", "seconds", seconds, 0.0))
 
     def phase(self, period: float) -> AbstractScalar:
         """Return which part of a period [s] has passed, from 0 to 1; of a whole number of steps it is exact."""
+        check_positive("World.phase", "period", period)
         whole = self.whole_steps(period)
         periods = AbstractScalar(floor(as_value(self.steps * (1.0 / whole))))
         return (self.steps - whole * periods) * (1.0 / whole)
@@ -381,10 +384,11 @@ class World:
     def imu(self, name: Any) -> Imu:
         """Return what an inertial measurement unit at a frame measures; ``name`` as :meth:`frame`.
 
-        The acceleration is that of the last step of the dynamics. A world that has just started anew is at rest.
+        The acceleration is that of the last step of the dynamics. In the first observation of an episode it is that of
+        a step from its state with the action 0, which nothing else sees.
         """
         frame, at = self.frame(name), self._layout.frame(name)
-        acceleration = self._quiet(vector(self._scalar("frame_acceleration", 6 * at + i) for i in range(3)))
+        acceleration = vector(self._scalar("frame_acceleration", 6 * at + i) for i in range(3))
         felt = acceleration - vector(as_scalar(x) for x in self.value("gravity"))
         turned = (rotate_back(frame.quaternion, v) for v in (felt, frame.angular_velocity))
         return Imu(*turned)

@@ -57,13 +57,13 @@ def compiled(file: Path) -> tuple[mujoco.MjModel, list[str], dict[int, str]]:
         missing = {int(geom.id): kind for geom, kind in shapeless}
         return model, [f"{', '.join(dropped)}, with which MuJoCo refuses the file ({refusal})"], missing
     words = one_line(last)
-    lost = (
-        ", or put that file there, or give the body that takes its mass from it an <inertial>" if LOST in words else ""
-    )
+    lost = ", or put that file there" if LOST in words else ""
+    if lost and INCLUDE not in words:
+        lost += ", or give the body that takes its mass from it an <inertial>"
     raise ValueError(f"load: {str(file)!r}: MuJoCo refuses it: {words}; correct the file{lost}") from None
 
 
-LOST = "Error opening file"  # MuJoCo's words for a file that is not there
+LOST, INCLUDE = "Error opening file", "Element 'include'"  # MuJoCo's words for a file that is not there, of an element
 MOST_LETTERS = 1000  # of MuJoCo's messages, which hold names of the file
 REFUSALS = (ValueError, RuntimeError, MemoryError, mujoco.FatalError, mujoco.UnexpectedError)
 """What MuJoCo's compiler raises, of memory that it does not get, too."""

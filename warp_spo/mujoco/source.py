@@ -45,7 +45,12 @@ class Source:
 
     def name(self, kind: str, index: int) -> str:
         """Return the name of an element, "" if it has none; ``kind`` is "body", "joint", "actuator" and so on."""
-        return mujoco.mj_id2name(self.model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), index) or ""
+        try:
+            return mujoco.mj_id2name(self.model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), index) or ""
+        except UnicodeDecodeError:
+            self.refuse(
+                f"the name of {kind} {index}, which is not UTF-8,", "save the file as UTF-8: MuJoCo reads no other"
+            )
 
     def label(self, kind: str, index: int, wanted: str) -> str:
         """Return the name of an element, or ``wanted`` if it has none, or another that no element of its kind has.

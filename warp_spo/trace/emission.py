@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -14,6 +15,8 @@ from .branches import Sides, branch_of, find_blocks, in_order
 from .fusion import Chain, choose_chains, choose_products
 from .scalars import BRANCHES, Scalar, Value, is_constant, is_literal, lookup, ordered, search
 
+BEYOND_FLOAT32 = 2.0**128 - 2.0**103
+"""Least number that float32 rounds to infinity."""
 C_TYPE = {"float32": "float", "float64": "double"}
 LIBRARY = {"exponential": "exp", "logarithm": "log", "power": "pow", "floor": "floor"}  # functions of C, also on CUDA
 SIGN = {"neg": "-", "cut": ""}
@@ -57,6 +60,8 @@ def literal(x: float, dtype: str) -> str:
     """Return the C++ literal of a number in the scalar type ``dtype``."""
     if x != x:
         return "nan"
+    if dtype == "float32" and abs(x) >= BEYOND_FLOAT32:
+        x = math.copysign(math.inf, x)
     if x in (float("inf"), -float("inf")):
         return "-infinity" if x < 0.0 else "infinity"
     if dtype == "float64":

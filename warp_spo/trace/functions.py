@@ -109,6 +109,16 @@ class AbstractScalar:
     def __rpow__(self, other: Any) -> Any:
         return _apply(_power, other, self)
 
+    def __mod__(self, other: Any) -> Any:
+        return refuse("%, // or divmod")
+
+    __rmod__ = __floordiv__ = __rfloordiv__ = __divmod__ = __rdivmod__ = __mod__
+
+    def __round__(self, digits: Any = None) -> Any:
+        return refuse("round, math.floor, ceil or trunc")
+
+    __floor__ = __ceil__ = __trunc__ = __round__
+
     def __neg__(self) -> AbstractScalar:
         return AbstractScalar(negative(self.value))
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,6 +44,20 @@ def one_number(what: str, value: Any) -> Any:
     return numbers(what, value, 1)[0]
 
 
+@contextlib.contextmanager
+def naming(what: str) -> Iterator[None]:
+    """Let errors that a user's function raises begin with ``what``, its name, unless they name it."""
+    try:
+        yield
+    except Exception as error:  # of any type: it stays what it is
+        words = error.args[0] if len(error.args) == 1 and isinstance(error.args[0], str) else None
+        if words is None:
+            error.add_note(f"Env: {what} raised it.")
+        elif not words.startswith(f"Env: {what}"):
+            error.args = (f"Env: {what}: {words.removeprefix('Env: ')}",)
+        raise
+
+
 def condition(what: str, value: Any) -> Condition:
     """Return a comparison, a bool, or the number of a term in torch, as a condition.
 
@@ -68,7 +84,8 @@ def check_event(event: Any, number: int) -> Any:
 
     def change(w: World) -> None:
         state, values = {"q": w.scene.coord_count, "qd": w.scene.dof_count}, {*w.values}
-        event.change(w)
+        with naming(f"events[{number}]"):
+            event.change(w)
         for name in state.keys() & w.__dict__.keys():
             w.__dict__[name] = numbers(f"{what} w.{name} to", w.__dict__[name], state[name])
         if unknown := sorted({*w.values} - values):
@@ -86,7 +103,8 @@ def check_event(event: Any, number: int) -> Any:
 
 def commands_drawn(commands: Any, w: World, done: Any) -> dict[str, Vector]:
     """Return a new command and what belongs to it, by name; errors as :func:`numbers`."""
-    drawn = commands.draw(w, done)
+    with naming("commands.draw"):
+        drawn = commands.draw(w, done)
     if not isinstance(drawn, dict) or "command" not in drawn:
         raise TypeError(f"Env: commands.draw returned {came(drawn)}; expected vectors by name, 'command' among them")
     for name in drawn.keys() - {"command"}:
@@ -97,7 +115,8 @@ def commands_drawn(commands: Any, w: World, done: Any) -> dict[str, Vector]:
 
 def command_updated(commands: Any, w: World, command: Vector) -> Vector:
     """Return the command after an update; errors as :func:`numbers`."""
-    return numbers("commands.update returned", commands.update(w, command), commands.size)
+    with naming("commands.update"):
+        return numbers("commands.update returned", commands.update(w, command), commands.size)
 
 
 def controls(part: Any, w: World, action: Vector, sizes: dict[str, int]) -> list[tuple[int, Any]]:
@@ -106,7 +125,9 @@ def controls(part: Any, w: World, action: Vector, sizes: dict[str, int]) -> list
     Raises:
         TypeError, ValueError: it sets no numbers, or an entry that is not there; the message names it.
     """
-    what, size, found = f"actions.{type(part).__name__}", sizes[part.array], part.trace(w, action)
+    what, size = f"actions.{type(part).__name__}", sizes[part.array]
+    with naming(what):
+        found = part.trace(w, action)
     if not isinstance(found, list | tuple) or not all(isinstance(each, tuple) and len(each) == 2 for each in found):
         raise TypeError(f"Env: {what}.trace returned {came(found)}; expected a list of (entry, number)")
     for entry, _ in found:

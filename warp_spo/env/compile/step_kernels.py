@@ -26,7 +26,16 @@ from .buffers import FAULT
 from .fused_kernel import FusedKernel
 from .guard import BEYOND, LARGEST, NOT_FINITE, Check, first, within
 from .memory_layout import MemoryLayout
-from .returned import check_event, check_force, command_updated, commands_drawn, condition, controls, one_number
+from .returned import (
+    check_event,
+    check_force,
+    command_updated,
+    commands_drawn,
+    condition,
+    controls,
+    naming,
+    one_number,
+)
 from .vectors import Vector, as_value, vector
 
 CHOSEN_WORLD = "chosen.data[world]"  # C++: the world has just started anew
@@ -155,7 +164,9 @@ class Tracing:
         total: Any = 0.0
         earned = {}
         for name, (weight, term) in self.rewards.items():
-            value = w.at_level(weight) * self.layout.step_dt * one_number(f"reward {name!r} returned", term(w))
+            with naming(f"reward {name!r}"):
+                earning = one_number(f"reward {name!r} returned", term(w))
+            value = w.at_level(weight) * self.layout.step_dt * earning
             total = total + value
             checks.append(self.guard.check(f"reward/{name}", [value]))
             earned[name] = value
@@ -166,7 +177,10 @@ class Tracing:
             stage.store(FAULT, 0, as_value(fault))
         for name, value in earned.items():
             w.keep_own(f"sum reward {name}", w.memory(f"sum reward {name}", 1) + where(bad, 0.0, value))
-        ends = {name: condition(f"termination {name!r} returned", term(w)) for name, term in self.terminations.items()}
+        ends = {}
+        for name, term in self.terminations.items():
+            with naming(f"termination {name!r}"):
+                ends[name] = condition(f"termination {name!r} returned", term(w))
         ends |= self.guard.ends(fault)
         self.bad, self.ended = bad, self.guard.mend(w, state)
         measured = self._measure(w, bad)
@@ -199,7 +213,8 @@ class Tracing:
         Steps in which a metric is not finite do not count for it.
         """
         for name, term in self.layout.metrics.items():
-            value = one_number(f"metric {name!r} returned", term(w))
+            with naming(f"metric {name!r}"):
+                value = one_number(f"metric {name!r} returned", term(w))
             counts = within([value], LARGEST) & ~bad
             for memory, more in ((f"sum metric {name}", value), (f"steps of metric {name}", 1.0)):
                 w.keep_own(memory, w.memory(memory, 1) + where(counts, more, 0.0))
@@ -434,7 +449,12 @@ class Tracing:
         for name, (_, size, reset) in self.layout.memory.items():
             if reset is not None:
                 start.kept[name] = vector([reset] * size)
-        found = starts.reports(start, self.actions, self.observed_entries)
+        wanted = self.observed_entries
+        if any(array == "frame_acceleration" for array, _ in wanted):  # of a step with these controls
+            sizes = self.layout.control_sizes
+            acted = [name for name in starts.CONTROLS if name in self.layout.action_arrays]
+            wanted = wanted | {(name, entry) for name in acted for entry in range(sizes[name])}
+        found = starts.reports(start, self.actions, wanted)
         olds = [w._scalar(*key) for key in found]
         for key, value in zip(
             found, choose(done, [*map(AbstractScalar, found.values())], olds, "reports"), strict=True
