@@ -302,7 +302,7 @@ class _SegmentProgram:
         registers a thread needs then. The first entry applies that fits into the registers and the shared memory. If
         none does, the warps of one block share all registers.
         """
-        warps = 1 if self.alone else self.schedule.warps
+        warps = 1 if self.alone else self.schedule.warps + layout.helpers
         if self.dtype == "float32" and not self.plan.latency_bound:
             for blocks, needed in self.job.routine.hints.occupancy:
                 registers = self._shared_registers(blocks * self.schedule.warps)
