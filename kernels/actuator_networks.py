@@ -96,15 +96,14 @@ class Joints(NamedTuple):
             ]
         return text
 
-    def measure(self, target: str, q: str = "q_row[at]", qd: str = "qd_row[dof]", suffix: str = "") -> list[str]:
-        """Return code that makes ``error_0`` and ``rate_0``, and keeps them where ``keeps`` is set."""
-        ring, slots, text = f"ring{suffix}.data", max(self.lags), []
-        if slots:
-            text = [
-                f"const long long slot = (2 * (age % {slots}) * {self.count} + joint) * columns + world;",
-                f"if (keeps) {{ {ring}[slot] = error_0; {ring}[slot + {self.count} * columns] = rate_0; }}",
-            ]
-        return [f"const float error_0 = {target} - {q};", f"const float rate_0 = {qd};", *text]
+    def keep(self, suffix: str = "") -> list[str]:
+        """Return code that keeps ``error_0`` and ``rate_0`` of substep ``age``."""
+        ring, slots = f"ring{suffix}.data", max(self.lags)
+        return [
+            f"const long long slot = (2 * (age % {slots}) * {self.count} + joint) * columns + world;",
+            f"{ring}[slot] = error_0;",
+            f"{ring}[slot + {self.count} * columns] = rate_0;",
+        ] if slots else []  # fmt: skip
 
     def inputs(self) -> list[tuple[int, str]]:
         """Return (substeps ago, C++) of each input."""
@@ -182,7 +181,8 @@ def torques(joints: Joints, force_entries: int, block: int) -> wp.Kernel:
         f"const int age = (int)memory.data[{joints.age} * columns + world] * {joints.decimation} + (int)substep;",
         *joints.places(),
         *joints.recall(),
-        *joints.measure(f"target.data[{row}]", f"q.data[{row}]", f"qd.data[world * {qd_size} + dof]"),
+        f"const float error_0 = target.data[{row}] - q.data[{row}], rate_0 = qd.data[world * {qd_size} + dof];",
+        *_block("keeps", joints.keep()),
     ]
     inputs = [x for _, x in joints.inputs()]
     if half is None:
@@ -230,7 +230,8 @@ def before_substep(joints: Joints, number: int) -> Before:
     whole = [
         *joints.places(suffix),
         *joints.recall(suffix),
-        *joints.measure(target, suffix=suffix),
+        f"const float error_0 = {target} - q_row[at], rate_0 = qd_row[dof];",
+        *_block("keeps", joints.keep(suffix)),
         f"const float x[] = {{{', '.join(x for _, x in joints.inputs())}}};",
         *joints.limited(f"network{suffix}::torque(x)", suffix),
     ]
@@ -252,36 +253,44 @@ def before_substep(joints: Joints, number: int) -> Before:
         return Before(joints.define(suffix), "", "", "\n".join(each), _braced(cpu), 0)
     size, pitched = joints.half.staged, tensor_networks.PITCH
     inputs = list(enumerate(joints.inputs()))
+    held = "own[{} + joint * 96 + {} + lane]".format
     gathered = [  # warps without other work gather, if there are any
-        *head,
-        "constexpr int gatherers = helpers ? helpers : everyone;",
-        "const int gatherer = warp - (everyone - gatherers);",
-        "#pragma unroll",
         f"for (int turn = 0; turn < ({count} + gatherers - 1) / gatherers; ++turn) {{",
         "const int joint = gatherer + gatherers * turn;",
         f"if (gatherer < 0 || joint >= {count}) break;",
         f"float* staged = own + joint * {size} + lane;",
-        f"float* held = own + {count * size} + joint * 32 + lane;",
         *joints.places(suffix),
     ]
+    head += [
+        "constexpr int gatherers = helpers ? helpers : everyone;",
+        "const int gatherer = warp - (everyone - gatherers);",
+    ]
     start = [
+        *head,
         *gathered,
-        f"*held = {target};",
+        f"{held(count * size, 0)} = {target};",
         *(f"staged[{k * pitched}] = 0.0f;" for k in range(len(inputs), joints.half.rows)),
         "}",
     ]
+    kept = [f"const int age = {age} + substep;", f"const float error_0 = {held(count * size, 32)};"]
+    kept += [f"const float rate_0 = {held(count * size, 64)};", *joints.keep(suffix)]
     beside = [
+        *head,
+        "#pragma unroll 1",
         *gathered,
+        *_block("helpers && mine && substep >= 0", kept if max(joints.lags) else []),
         f"const int age = {age} + substep + (helpers ? 1 : 0);",
         *joints.recall(suffix),
         *(f"staged[{k * pitched}] = {x};" for k, (lag, x) in inputs if lag),
         "}",
     ]
     each = [
+        *head,
+        "#pragma unroll",
         *gathered,
-        "const bool keeps = mine;",
-        f"const int age = {age} + substep;",
-        *joints.measure("*held", suffix=suffix),
+        f"const float error_0 = {held(count * size, 0)} - q_row[at], rate_0 = qd_row[dof];",
+        f"if (helpers) {{ {held(count * size, 32)} = error_0; {held(count * size, 64)} = rate_0; }}",
+        *_block("!helpers && mine", [f"const int age = {age} + substep;", *joints.keep(suffix)]),
         *(f"staged[{k * pitched}] = {x};" for k, (lag, x) in inputs if not lag),
         "}",
         "__syncthreads();",
@@ -301,8 +310,13 @@ def before_substep(joints: Joints, number: int) -> Before:
         "}",
     ]
     return Before(
-        joints.define(suffix), *("\n".join(part) for part in (start, beside, each)), _braced(cpu), count * (size + 32)
+        joints.define(suffix), *("\n".join(part) for part in (start, beside, each)), _braced(cpu), count * (size + 96)
     )
+
+
+def _block(condition: str, lines: list[str]) -> list[str]:
+    """Return code behind a condition, none where there is none."""
+    return [f"if ({condition}) {{", *lines, "}"] if lines else []
 
 
 def _braced(lines: list[str]) -> str:
