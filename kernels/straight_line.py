@@ -38,7 +38,6 @@ from .substeps import (
 
 # shared memory that a block may declare: 48 KiB less the share that Warp uses; more is asked for at the launch
 SHARED_BYTES = 46 * 1024
-COUPLED_BYTES = 220 * 1024  # of a block whose segments couple pairs of bodies: all that a multiprocessor has
 WIDE_BYTES = 110 * 1024  # shared memory of a block with long rows, of which two fit into an H100's 228 KiB
 IN_PLACE, STAGED, MAPPED, RELAYED, TILED, DIRECT = "in place", "staged", "mapped", "relayed", "tiled", "direct"
 BY_TABLE = (MAPPED, RELAYED)  # the ways in which a table says which value each entry of a row receives
