@@ -25,6 +25,7 @@ from warp_spo.env import Env, actions, learning
 from warp_spo.env.actuator_nets import ActuatorNetwork
 from warp_spo.env.compile import actuator_launches
 from warp_spo.env.tasks import go2_flat
+from warp_spo.execution import plan
 from warp_spo.kernels import tensor_networks
 
 from . import command_line, env_times
@@ -37,10 +38,11 @@ WAYS: dict[str, dict[str, Any]] = {
     "network": {},
     "kernels apart": {"JOINED_ON": ()},
     "products in float32": {"TENSOR_CORES": False},
-    "a joint at a time": {"TOGETHER": 1},
+    "without helpers": {"MOST_TEAM": 0},
     "a reciprocal each": {"PAIRS": False},
 }
-"""Constants of ``actuator_launches`` and ``tensor_networks``, by the name of a row."""
+"""Constants of MODULES, by the name of a row."""
+MODULES = actuator_launches, plan, tensor_networks
 MOST = 1.2  # times the step with servos
 SAME = 1e-6  # of the largest torque
 
@@ -72,7 +74,7 @@ def build_way(worlds: int, device: Any, net: ActuatorNetwork, changes: dict[str,
     """Return the task with a network and other constants."""
     with contextlib.ExitStack() as held:
         for name, value in changes.items():
-            module = tensor_networks if hasattr(tensor_networks, name) else actuator_launches
+            module = next(each for each in MODULES if hasattr(each, name))
             held.enter_context(mock.patch.object(module, name, value))
         return build(worlds, device, net, **options)
 

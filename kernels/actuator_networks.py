@@ -18,6 +18,7 @@ from . import native, tensor_networks
 from .elementary import C_TYPE
 from .elementary import NATIVE as ELEMENTARY
 from .long_results import WARP_SIZE
+from .shared_rows import pitch
 from .substeps import SUBSTEPS, Before
 
 ACTIVATIONS = {
@@ -76,42 +77,51 @@ class Joints(NamedTuple):
         """Number of weights in the text."""
         return sum(len(weights) * len(weights[0]) for weights, _ in self.layers)
 
-    def gather(self, suffix: str = "", q: str = "q_row[{}]", qd: str = "qd_row[{}]") -> list[str]:
-        """Return code that reads the inputs of ``joint`` into ``x`` and keeps them, where ``keeps`` is set."""
-        count, slots = self.count, max(self.lags)
-        ring, target = f"ring{suffix}.data", f"target{suffix}.data"
-        text = [
+    def places(self, suffix: str = "") -> list[str]:
+        """Return code that finds coordinate and dof of ``joint``."""
+        return [
             f"const int at = {_indexed('coordinates' + suffix, self.coordinates)};",
             f"const int dof = {_indexed('dofs' + suffix, self.dofs)};",
-            f"const float error = {target}[world * {self.sizes[0]} + at] - {q.format('at')};",
-            f"const float rate = {qd.format('dof')};",
         ]
+
+    def recall(self, suffix: str = "") -> list[str]:
+        """Return code that reads errors and rates of before, ``error_LAG`` and ``rate_LAG``."""
+        ring, slots, text = f"ring{suffix}.data", max(self.lags), []
         for lag in filter(None, self.lags):
-            slot, row = f"slot_{lag}", f"2 * ((age - {lag} + {slots}) % {slots}) * {count} + joint"
+            row = f"2 * ((age - {lag} + {slots}) % {slots}) * {self.count} + joint"
             text += [
-                f"const long long {slot} = ({row}) * columns + world;",
-                f"const float error_{lag} = age >= {lag} ? {ring}[{slot}] : 0.0f;",
-                f"const float rate_{lag} = age >= {lag} ? {ring}[{slot} + {count} * columns] : 0.0f;",
+                f"const long long slot_{lag} = ({row}) * columns + world;",
+                f"const float error_{lag} = age >= {lag} ? {ring}[slot_{lag}] : 0.0f;",
+                f"const float rate_{lag} = age >= {lag} ? {ring}[slot_{lag} + {self.count} * columns] : 0.0f;",
             ]
-        if slots:
-            text += [
-                f"const long long slot = (2 * (age % {slots}) * {count} + joint) * columns + world;",
-                f"if (keeps) {{ {ring}[slot] = error; {ring}[slot + {count} * columns] = rate; }}",
-            ]
-        inputs = [f"{'error_' + str(x) if x else 'error'} * {_number(self.scales[0])}" for x in self.lags]
-        rates = [f"{'rate_' + str(x) if x else 'rate'} * {_number(self.scales[1])}" for x in self.lags]
-        inputs = [*inputs, *rates] if self.error_first else [*rates, *inputs]
-        return [*text, f"const float x[] = {{{', '.join(inputs)}}};"]
+        return text
+
+    def keep(self, suffix: str = "") -> list[str]:
+        """Return code that keeps ``error_0`` and ``rate_0`` of substep ``age``."""
+        ring, slots = f"ring{suffix}.data", max(self.lags)
+        return [
+            f"const long long slot = (2 * (age % {slots}) * {self.count} + joint) * columns + world;",
+            f"{ring}[slot] = error_0;",
+            f"{ring}[slot + {self.count} * columns] = rate_0;",
+        ] if slots else []  # fmt: skip
+
+    def inputs(self) -> list[tuple[int, str]]:
+        """Return (substeps ago, C++) of each input."""
+        errors, rates = (
+            [(lag, f"{name}_{lag} * {_number(scale)}") for lag in self.lags]
+            for name, scale in zip(("error", "rate"), self.scales, strict=False)
+        )
+        return [*errors, *rates] if self.error_first else [*rates, *errors]
 
     def tables(self, suffix: str = "") -> list[str]:
-        """Return the tables that :meth:`gather` reads."""
+        """Return the tables that :meth:`places` reads."""
         named = (("coordinates", self.coordinates), ("dofs", self.dofs))
         return [_table(name + suffix, values, "int") for name, values in named if not _is_range(values)]
 
-    def define(self, suffix: str = "", together: int = 1) -> tuple[str, ...]:
-        """Return the definitions of the network, in HALF with so many joints ``together``."""
+    def define(self, suffix: str = "") -> tuple[str, ...]:
+        """Return the definitions of the network."""
         if self.half is not None:
-            return tensor_networks.PRODUCTS, tensor_networks.define(f"network{suffix}", self.half, together)
+            return tensor_networks.PRODUCTS, tensor_networks.define(f"network{suffix}", self.half)
         text = [f"struct network{suffix} {{", "static CUDA_CALLABLE inline float torque(const float* x0) {"]
         for i, (weights, biases) in enumerate(self.layers):
             outs, ins = len(biases), len(weights[0])
@@ -156,8 +166,9 @@ def torques(joints: Joints, force_entries: int, block: int) -> wp.Kernel:
         force_entries: of ``force`` of a world, of which ``mean_force`` gets the share of the substep before; 0: none.
             ``substep`` is the number of the present one.
     """
-    count = joints.count
+    count, half = joints.count, joints.half
     q_size, qd_size, _ = joints.sizes
+    row = f"world * {q_size} + at"
     text = [
         ELEMENTARY[C_TYPE[wp.float32]],
         *joints.define(),
@@ -168,20 +179,27 @@ def torques(joints: Joints, force_entries: int, block: int) -> wp.Kernel:
         "const long long world = keeps ? thread - joint * threads : worlds - 1;",
         *joints.tables(),
         f"const int age = (int)memory.data[{joints.age} * columns + world] * {joints.decimation} + (int)substep;",
-        *joints.gather("", f"q.data[world * {q_size} + {{}}]", f"qd.data[world * {qd_size} + {{}}]"),
+        *joints.places(),
+        *joints.recall(),
+        f"const float error_0 = target.data[{row}] - q.data[{row}], rate_0 = qd.data[world * {qd_size} + dof];",
+        *_block("keeps", joints.keep()),
     ]
-    if joints.half is None:
-        text += ["const float found = network::torque(x);"]
+    inputs = [x for _, x in joints.inputs()]
+    if half is None:
+        text += [f"const float x[] = {{{', '.join(inputs)}}};", "const float found = network::torque(x);"]
     else:
-        size = joints.half.staged
         text += [
-            f"__shared__ float shared[{block // WARP_SIZE * size}];",
-            f"float* staged = shared + threadIdx.x / 32 * {size};",
-            *tensor_networks.stage(joints.half, "staged", "threadIdx.x % 32"),
+            f"__shared__ float shared[{block // WARP_SIZE * half.staged}];",
+            f"float* staged = shared + threadIdx.x / 32 * {half.staged};",
+            "const int lane = threadIdx.x & 31, t = lane & 3;",
+            *(f"staged[{k * tensor_networks.PITCH} + lane] = {x};" for k, x in enumerate(inputs)),
+            *(f"staged[{k * tensor_networks.PITCH} + lane] = 0.0f;" for k in range(len(inputs), half.rows)),
             "__syncwarp();",
-            "float each[1];",
-            "network::torques(staged, weights.data, each);",
-            "const float found = each[0];",
+            "float low[2], high[2];",
+            "network::tile(staged, weights.data, low);",
+            "network::tile(staged + 16, weights.data, high);",
+            "const float own = t == 0 ? low[0] : t == 1 ? low[1] : t == 2 ? high[0] : high[1];  // row 8 t + lane / 4",
+            "const float found = __shfl_sync(0xffffffffu, own, 4 * (lane & 7) + (lane >> 3));",
         ]
     text += [*joints.limited("found"), f"if (keeps) tau.data[world * {qd_size} + dof] = torque;"]
     if force_entries:
@@ -196,69 +214,113 @@ def torques(joints: Joints, force_entries: int, block: int) -> wp.Kernel:
     return native.kernel("actuator_network", "\n".join([*text, ""]), arrays, wp.float32)
 
 
-def before_substep(joints: Joints, number: int, together: int) -> Before:
+def before_substep(joints: Joints, number: int) -> Before:
     """Return code of the kernel of a step that writes ``tau_row`` before each substep.
 
     The arrays of OWN have the names ``NAME_number``.
 
     Args:
-        joints: their network. number: of the network. together: joints whose layers a warp evaluates side by side.
+        joints: their network. number: of the network.
     """
-    suffix, half = f"_{number}", joints.half
-    start = [
-        "const long long columns = worlds;",
-        f"const int age = (int)memory{suffix}.data[{joints.age} * columns + world] * {joints.decimation} + substep;",
-        f"const bool ends = substep + 1 == (int){SUBSTEPS}_row[0];",
+    suffix, count, dof_count = f"_{number}", joints.count, joints.sizes[1]
+    age = f"(int)memory{suffix}.data[{joints.age} * columns + world] * {joints.decimation}"
+    head = ["const long long columns = worlds;", *joints.tables(suffix)]
+    ends = f"substep + 1 == (int){SUBSTEPS}_row[0]"
+    target = f"target{suffix}.data[world * {joints.sizes[0]} + at]"
+    whole = [
+        *joints.places(suffix),
+        *joints.recall(suffix),
+        f"const float error_0 = {target} - q_row[at], rate_0 = qd_row[dof];",
+        *_block("keeps", joints.keep(suffix)),
+        f"const float x[] = {{{', '.join(x for _, x in joints.inputs())}}};",
+        *joints.limited(f"network{suffix}::torque(x)", suffix),
     ]
-    write = f"tau.data[world * {joints.sizes[1]} + dof] = torque;"
-    end = [*joints.limited("found", suffix), "tau_row[dof] = torque;", f"if (keeps && ends) {write}"]
-    evaluate = [*joints.gather(suffix), f"const float found = network{suffix}::torque(x);"]
-    cpu = ["const bool keeps = true;", f"for (int joint = 0; joint < {joints.count}; ++joint) {{"]
-    cpu += [*evaluate, *joints.limited("found", suffix), write, "}"]
-    if half is None:
-        cuda = [
-            "#pragma unroll 1",
-            f"for (int joint = warp; joint < {joints.count}; joint += warps) {{",
+    write = f"tau.data[world * {dof_count} + dof] = torque;"
+    cpu = [*head, f"const int age = {age} + substep;", "const bool keeps = true;"]
+    cpu += [f"for (int joint = 0; joint < {count}; ++joint) {{", *whole, write, "}"]
+    if joints.half is None:
+        each = [
+            *head,
+            f"const int age = {age} + substep;",
             "const bool keeps = mine;",
-            *evaluate,
-            *end,
+            "#pragma unroll 1",
+            f"for (int joint = warp; joint < {count}; joint += everyone) {{",
+            *whole,
+            "tau_row[dof] = torque;",
+            f"if (keeps && {ends}) {write}",
             "}",
         ]
-    else:
-        cuda = [
-            f"constexpr int turns = ({joints.count} + warps * {together} - 1) / (warps * {together}) * {together};",
-            f"float* staged = own + warp * turns * {half.staged};",
-            "#pragma unroll",
-            "for (int turn = 0; turn < turns; ++turn) {",
-            f"const int wanted = warp + warps * turn, joint = wanted < {joints.count} ? wanted : {joints.count - 1};",
-            "const bool keeps = mine && wanted == joint;",
-            *joints.gather(suffix),
-            *tensor_networks.stage(half, f"(staged + turn * {half.staged})", "lane"),
-            "}",
-            "__syncwarp();",
-            "#pragma unroll 1",
-            f"for (int first = 0; first < turns; first += {together}) {{",
-            f"float each[{together}];",
-            f"network{suffix}::torques(staged + first * {half.staged}, weights{suffix}.data, each);",
-            "#pragma unroll",
-            f"for (int k = 0; k < {together}; ++k) {{",
-            "const int joint = warp + warps * (first + k);",
-            f"if (joint >= {joints.count}) break;",
-            f"const int dof = {_indexed('dofs' + suffix, joints.dofs)};",
-            "const float found = each[k];",
-            "const bool keeps = mine;",
-            *end,
-            "}",
-            "}",
-        ]
-    text = ["{", *joints.tables(suffix), *start]
-
-    def scalars(warps: int) -> int:
-        return 0 if half is None else -(-joints.count // (warps * together)) * warps * together * half.staged
-
+        return Before(joints.define(suffix), "", "", "\n".join(each), _braced(cpu), 0)
+    size, pitched = joints.half.staged, tensor_networks.PITCH
+    inputs = list(enumerate(joints.inputs()))
+    held = "own[{} + joint * 96 + {} + lane]".format
+    gathered = [  # warps without other work gather, if there are any
+        f"for (int turn = 0; turn < ({count} + gatherers - 1) / gatherers; ++turn) {{",
+        "const int joint = gatherer + gatherers * turn;",
+        f"if (gatherer < 0 || joint >= {count}) break;",
+        f"float* staged = own + joint * {size} + lane;",
+        *joints.places(suffix),
+    ]
+    head += [
+        "constexpr int gatherers = helpers ? helpers : everyone;",
+        "const int gatherer = warp - (everyone - gatherers);",
+    ]
+    start = [
+        *head,
+        *gathered,
+        f"{held(count * size, 0)} = {target};",
+        *(f"staged[{k * pitched}] = 0.0f;" for k in range(len(inputs), joints.half.rows)),
+        "}",
+    ]
+    kept = [f"const int age = {age} + substep;", f"const float error_0 = {held(count * size, 32)};"]
+    kept += [f"const float rate_0 = {held(count * size, 64)};", *joints.keep(suffix)]
+    beside = [
+        *head,
+        "#pragma unroll 1",
+        *gathered,
+        *_block("helpers && mine && substep >= 0", kept if max(joints.lags) else []),
+        f"const int age = {age} + substep + (helpers ? 1 : 0);",
+        *joints.recall(suffix),
+        *(f"staged[{k * pitched}] = {x};" for k, (lag, x) in inputs if lag),
+        "}",
+    ]
+    each = [
+        *head,
+        "#pragma unroll",
+        *gathered,
+        f"const float error_0 = {held(count * size, 0)} - q_row[at], rate_0 = qd_row[dof];",
+        f"if (helpers) {{ {held(count * size, 32)} = error_0; {held(count * size, 64)} = rate_0; }}",
+        *_block("!helpers && mine", [f"const int age = {age} + substep;", *joints.keep(suffix)]),
+        *(f"staged[{k * pitched}] = {x};" for k, (lag, x) in inputs if not lag),
+        "}",
+        "__syncthreads();",
+        "const int in_tile = lane >> 2, part = lane & 3;",
+        "#pragma unroll 1",
+        f"for (int tile = warp; tile < {2 * count}; tile += everyone) {{",
+        "const int joint = tile >> 1, row = 16 * (tile & 1) + in_tile + 8 * (part & 1);",
+        "const long long world = first + (row < present ? row : present - 1);",
+        *joints.places(suffix)[1:],
+        "float sums[2];",
+        f"network{suffix}::tile(own + joint * {size} + 16 * (tile & 1), weights{suffix}.data, sums);",
+        *joints.limited("(part ? sums[1] : sums[0])", suffix),
+        "if (part < 2) {",
+        f"(tau_row + (row - lane) * {pitch(dof_count)})[dof] = torque;",
+        f"if (row < present && {ends}) {write}",
+        "}",
+        "}",
+    ]
     return Before(
-        joints.define(suffix, together), "\n".join([*text, *cuda, "}"]), "\n".join([*text, *cpu, "}"]), scalars
+        joints.define(suffix), *("\n".join(part) for part in (start, beside, each)), _braced(cpu), count * (size + 96)
     )
+
+
+def _block(condition: str, lines: list[str]) -> list[str]:
+    """Return code behind a condition, none where there is none."""
+    return [f"if ({condition}) {{", *lines, "}"] if lines else []
+
+
+def _braced(lines: list[str]) -> str:
+    return "\n".join(["{", *lines, "}"])
 
 
 def _number(x: float) -> str:

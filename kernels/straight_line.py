@@ -94,7 +94,7 @@ class KernelLayout(NamedTuple):
         repeats: the statements are those of a substep, see :mod:`.substeps`.
         spill_slots: the number of values that a thread sets aside in shared memory, as ``ASIDE(i)``.
         near: names and entries of tables that a team copies to shared memory, as ``near_NAME[i]``: loops wait for them.
-        before: code that runs before each substep.
+        before: code that runs before each substep. helpers: warps of a team that run nothing else.
     """
 
     rows: list[SharedRow]
@@ -115,6 +115,12 @@ class KernelLayout(NamedTuple):
     spill_slots: int = 0
     near: tuple[tuple[str, int], ...] = ()
     before: tuple[Before, ...] = ()
+    helpers: int = 0
+
+    @property
+    def team(self) -> int:
+        """The threads that work on 32 worlds."""
+        return WARP_SIZE * (self.warps + self.helpers)
 
     @property
     def state(self) -> list[SharedRow]:
@@ -132,7 +138,7 @@ class KernelLayout(NamedTuple):
     @property
     def groups(self) -> int:
         """The number of groups of 32 worlds in a block."""
-        return self.block // (WARP_SIZE * self.warps)
+        return self.block // self.team
 
     @property
     def shared_scalars(self) -> int:
@@ -141,7 +147,7 @@ class KernelLayout(NamedTuple):
         rows += sum(pitch(row.entries) for row in self.staged_further if self.replaced(row) is None)
         rows += pitch(self.result.array.entries) if self.result.way == STAGED else 0
         scalars = WARP_SIZE * (rows + self.messages + self.warps * self.spill_slots + sum(map(len, self.cached)))
-        scalars += max((each.scalars(self.warps) for each in self.before), default=0)
+        scalars += sum(each.scalars for each in self.before)
         if self.result.way == RELAYED:
             return max(scalars, self.result.slot_layout.scalars)
         return scalars + (self.result.slot_layout.scalars if self.result.way == MAPPED else 0)
@@ -230,18 +236,17 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
 
 def _cuda_text(layout: KernelLayout, statements: str, T: type) -> list[str]:
     """Return the code of a thread on CUDA around its statements."""
-    c, places, team = C_TYPE[T], _Places(layout), WARP_SIZE * layout.warps
+    c, places = C_TYPE[T], _Places(layout)
+    start: list[str] = []
     if layout.before:
-        own = f"constexpr int warps = {layout.warps}; {c}* own = stage + {places.before};"
-        ends = [f"{each.cuda}\n{_barrier(layout)}" for each in layout.before]
-        statements = "\n".join(["{", own, *ends, "}", statements])
+        start, statements = _before_substeps(layout, places, statements, c)
     copied, statements = _copy_in(layout, places, statements, c)
     if layout.retries:
         statements = (
             f"for (int again = 0;; ++again) {{\n{statements}\nif (again || !(farthest > on::reach())) break;\n}}"
         )
     if layout.repeats:
-        statements = repeat_on_cuda(statements, layout.warps > 1)
+        statements = "\n".join([*start, repeat_on_cuda(statements, layout.warps > 1)])
     text = [*_find_worlds(layout), *_declare_stage(layout, T), *_fetch_tables(layout, c)]
     text += [*_declare_rows(layout, places, c), *copied]
     text += [WAIT_FOR_COPIES, _barrier(layout)] if layout.near else []
@@ -251,11 +256,30 @@ def _cuda_text(layout: KernelLayout, statements: str, T: type) -> list[str]:
     if layout.spill_slots:  # volatile, because a compiler would keep in a register what it stores
         text += [
             f"volatile {c}* aside = stage + {places.spill_slots} + member;",
-            f"#define ASIDE(i) aside[(i) * {team}]",
+            f"#define ASIDE(i) aside[(i) * {WARP_SIZE * layout.warps}]",
         ]
     text += [*([] if layout.cached else define_fields(layout.fields, c)), statements, *_copy_out(layout, places, T)]
     text += ["#undef FIELD"] if layout.cached else []
     return [*text, *(["#undef ASIDE"] if layout.spill_slots else [])]
+
+
+def _before_substeps(layout: KernelLayout, places: _Places, statements: str, c: str) -> tuple[list[str], str]:
+    """Return code before the first substep, and the statements of a substep behind what runs before each."""
+    barrier, at, parts = _barrier(layout), places.before, []
+    everyone, helpers = layout.warps + layout.helpers, layout.helpers
+    for one in layout.before:
+        own = f"constexpr int everyone = {everyone}, helpers = {helpers}; {c}* own = stage + {at};"
+        parts.append([f"{{\n{own}\n{text}\n}}" for text in (one.start, one.beside, one.each)])
+        at += one.scalars
+    starts, beside, each = (list(texts) for texts in zip(*parts, strict=True))
+    first = ["constexpr int substep = -1;", *starts, *(beside if helpers else ())]
+    first = ["{", *first, "}"]
+    if not helpers:
+        return first, "\n".join([*beside, *each, barrier, statements])
+    own_barrier = f"bar.sync 1, {WARP_SIZE * layout.warps};"
+    statements = statements.replace("bar.sync 0;", own_barrier)
+    main = [f"if (warp < {layout.warps}) {{", statements, "} else {", *beside, "}"]
+    return first, "\n".join([*each, barrier, *main])
 
 
 def _find_worlds(layout: KernelLayout) -> list[str]:
@@ -263,10 +287,10 @@ def _find_worlds(layout: KernelLayout) -> list[str]:
 
     Warp's own thread index costs a test whether to divide, 0.1 us of a kernel of 1.5 us, so it is not used here.
     """
-    team = WARP_SIZE * layout.warps
+    team = layout.team
     return [
         f"const int lane = threadIdx.x & 31, member = threadIdx.x % {team}, warp = member >> 5;",
-        f"const int start = blockIdx.x * {layout.block // layout.warps} + threadIdx.x / {team} * {WARP_SIZE};",
+        f"const int start = blockIdx.x * {layout.groups * WARP_SIZE} + threadIdx.x / {team} * {WARP_SIZE};",
         "const int present = worlds - start < 32 ? worlds - start : 32;",
         "const bool mine = lane < present;",
         "const long long first = start, world = mine ? start + lane : worlds - 1;",
@@ -282,12 +306,12 @@ def _declare_stage(layout: KernelLayout, T: type) -> list[str]:
     declared = [f"__shared__ __align__(16) {c} shared[{scalars}];"]
     if layout.asks_for_shared_memory(T):
         declared = ["extern __shared__ __align__(16) char asked_for[];", f"{c}* shared = ({c}*)asked_for;"]
-    return [*declared, f"{c}* stage = shared + (threadIdx.x / {WARP_SIZE * layout.warps}) * {layout.shared_scalars};"]
+    return [*declared, f"{c}* stage = shared + (threadIdx.x / {layout.team}) * {layout.shared_scalars};"]
 
 
 def _fetch_tables(layout: KernelLayout, c: str) -> list[str]:
     """Return code that starts to copy tables to shared memory, behind all else there."""
-    text, at, team = [], layout.groups * layout.shared_scalars, WARP_SIZE * layout.warps
+    text, at, team = [], layout.groups * layout.shared_scalars, layout.team
     for name, entries in layout.near:
         kind = "int" if name in INTEGERS else c
         text.append(f"{kind}* near_{name} = ({kind}*)(shared + {at});")
@@ -322,7 +346,7 @@ def _copy_in(layout: KernelLayout, places: _Places, statements: str, c: str) -> 
         lines.insert(next(i for i, line in enumerate(lines) if "FIELD(" in line), WAIT_FOR_COPIES)
         statements = "\n".join(lines)
     if layout.staged or layout.shared_rows:
-        some, team = layout.shared_rows, WARP_SIZE * layout.warps
+        some, team = layout.shared_rows, layout.team
         text += [copy_rows_in(some, places.rows, c, team, layout.direct, layout.late)] if some else []
         text += [_barrier(layout)]
         if layout.late:
@@ -352,7 +376,7 @@ def _result_in_memory(result: ResultLayout, c: str) -> str:
 
 def _copy_out(layout: KernelLayout, places: _Places, T: type) -> list[str]:
     """Return code that writes results from shared memory to memory."""
-    c, result, team, sync = C_TYPE[T], layout.result, WARP_SIZE * layout.warps, _barrier(layout)
+    c, result, team, sync = C_TYPE[T], layout.result, layout.team, _barrier(layout)
     start, width = places.result
     text: list[str] = []
     if layout.repeats:

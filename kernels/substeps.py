@@ -4,7 +4,6 @@ On CUDA the state of a world is in shared memory while the loop runs, or in the 
 the CPU it is in the rows of the result. All other rows stay as they are, and are read again.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 from .shared_rows import SharedRow
@@ -19,18 +18,23 @@ STATE = {"q": "q_out", "qd": "out"}  # the rows of the state, and the results th
 class Before(NamedTuple):
     """Code that writes ``tau_row`` before each substep.
 
-    On CUDA a row of tau is in shared memory, and all threads of a team that has ``warps`` run the code: 32 worlds, of
-    which ``lane`` has the one of the thread, ``world``. On the CPU the row is that of the caller's array.
+    On CUDA all threads of a team run it, ``everyone`` warps, and rows of tau are in shared memory. Of these warps
+    ``helpers`` have no other work, and may do ``beside`` what the substep before does. A warp has 32 worlds, the thread
+    ``world``; ``own`` is shared memory.
 
     Attributes:
-        define: texts of structures that the code uses. cuda, cpu: the code.
-        scalars: ``scalars(warps)``, of shared memory that it uses, from ``own`` on, and for which it leaves nothing.
+        define: texts of structures that the code uses.
+        start: before the first substep. beside: while the one before runs, or ahead of ``each``. each: the code.
+        cpu: all of it for the CPU, where ``tau_row`` is that of the caller's array.
+        scalars: of shared memory.
     """
 
     define: tuple[str, ...]
-    cuda: str
+    start: str
+    beside: str
+    each: str
     cpu: str
-    scalars: Callable[[int], int]
+    scalars: int
 
 
 def repeat_substeps(statements: str) -> str:

@@ -36,15 +36,20 @@ class Shape(NamedTuple):
     scales: tuple[float, ...]
 
     @property
+    def rows(self) -> int:
+        """Inputs in shared memory, those beyond ``inputs`` zero."""
+        return -(-self.inputs // 8) * 8
+
+    @property
     def staged(self) -> int:
-        """Scalars of shared memory of 32 rows of inputs."""
-        return -(-self.inputs // 8) * 8 * PITCH
+        """Scalars of shared memory of the inputs of 32 rows, [input, PITCH]."""
+        return self.rows * PITCH
 
     @property
     def places(self) -> list[tuple[int, int]]:
         """Where weights and biases of each layer begin in the array of weights, and behind them its end."""
         at, found = 0, []
-        for ins, outs in zip((-(-self.inputs // 8) * 16, *self.units), self.units, strict=False):
+        for ins, outs in zip((2 * self.rows, *self.units), self.units, strict=False):
             found.append((at, at + ins // 16 * outs // 8 * 128))
             at = found[-1][1] + outs
         return [*found, (at, at + self.units[-1]), (at + self.units[-1] + 1, 0)]
@@ -91,64 +96,51 @@ struct on_tensor_cores
 """Fragments of matrices are as PTX has them for mma.m16n8k8 of tf32 and mma.m16n8k16 of f16."""
 
 
-def stage(shape: Shape, where: str, lane: str) -> list[str]:
-    """Return code that puts the inputs ``x`` of the row of a lane into shared memory."""
-    rows = shape.staged // PITCH
-    return [f"{where}[{k * PITCH} + {lane}] = {f'x[{k}]' if k < shape.inputs else '0.0f'};" for k in range(rows)]
+def define(name: str, shape: Shape) -> str:
+    """Return the definition of ``name::tile(staged, weights, sums)``, which needs PRODUCTS.
 
-
-def define(name: str, shape: Shape, joints: int) -> str:
-    """Return the definition of ``name::torques(staged, weights, found)``, which needs PRODUCTS.
-
-    A warp calls it for 32 rows of each of ``joints``: ``staged`` in shared memory, see :func:`stage`, ``found[joints]``
-    the sums of the last layer for the row of the lane.
+    A warp calls it for 16 rows of inputs in shared memory, [input, PITCH]. Lane 4 g + t gets the sums of the last
+    layer of rows g and g + 8. The code is short on purpose: fetching it takes as long as running it.
     """
     text = [
         f"struct {name} {{",
         *_activation(shape.activation),
-        "static __device__ inline void torques(const float* staged, const float* weights, float* found)",
+        "static __device__ inline void tile(const float* staged, const float* weights, float* sums)",
         "{",
-        f"constexpr int joints = {joints}, tiles = 2 * joints;",
         "const int lane = threadIdx.x & 31, t = lane & 3, g = lane >> 2;",
     ]
     for layer, units in enumerate(shape.units):
         first, count = layer == 0, units // 8
-        steps = -(-shape.inputs // 8) if first else shape.units[layer - 1] // 16
+        steps = shape.rows // 8 if first else shape.units[layer - 1] // 16
         weights, biases = shape.places[layer]
         y, before = f"y{layer}", f"y{layer - 1}"
         text += [
-            f"float {y}[tiles][{count}][4];",
+            f"float {y}[{count}][4];",
             "#pragma unroll",
             f"for (int n = 0; n < {count}; ++n) {{",
             f"const float2 b = *(const float2*)(weights + {biases} + 8 * n + 2 * t);",
-            "#pragma unroll",
-            f"for (int m = 0; m < tiles; ++m)"
-            f" {{ {y}[m][n][0] = {y}[m][n][2] = b.x; {y}[m][n][1] = {y}[m][n][3] = b.y; }}",
+            f"{y}[n][0] = {y}[n][2] = b.x; {y}[n][1] = {y}[n][3] = b.y;",
             "}",
             "#pragma unroll",
             f"for (int step = 0; step < {steps}; ++step) {{",
-            "unsigned high[tiles][4], low[tiles][4];",
-            "#pragma unroll",
-            "for (int m = 0; m < tiles; ++m)",
+            "unsigned high[4], low[4];",
             "#pragma unroll",
             "for (int i = 0; i < 4; ++i) {",
         ]
         if first:
             text += [
-                f"const float x = staged[(m / 2) * {shape.staged} + (8 * step + t + 4 * (i / 2)) * {PITCH}"
-                " + 16 * (m & 1) + g + 8 * (i & 1)];",
-                "high[m][i] = __float_as_uint(x) & 0xffffe000u;  // NaN and infinity stay what they are",
-                "low[m][i] = __float_as_uint(x - __uint_as_float(high[m][i])) + 0x1000u;  // rounded when it is read",
+                f"const float x = staged[(8 * step + t + 4 * (i / 2)) * {PITCH} + g + 8 * (i & 1)];",
+                "high[i] = __float_as_uint(x) & 0xffffe000u;  // NaN and infinity stay what they are",
+                "low[i] = __float_as_uint(x - __uint_as_float(high[i])) + 0x1000u;  // rounded when it is read",
             ]
         else:
             text += [
-                f"const float* x = {before}[m][2 * step + i / 2] + 2 * (i & 1);",
+                f"const float* x = {before}[2 * step + i / 2] + 2 * (i & 1);",
                 "float a, b;",
-                "high[m][i] = on_tensor_cores::to_half(x[0], x[1]);",
-                "on_tensor_cores::from_half(high[m][i], a, b);",
-                "low[m][i] = on_tensor_cores::to_half(x[0] - a, x[1] - b);",
+                "high[i] = on_tensor_cores::to_half(x[0], x[1]);",
+                "on_tensor_cores::from_half(high[i], a, b);",
+                "low[i] = on_tensor_cores::to_half(x[0] - a, x[1] - b);",
             ]
-        product = "on_tensor_cores::" + ("tf32" if first else "half")
         text += [
             "}",
             f"uint4 w[{count}];",
@@ -156,46 +148,35 @@ def define(name: str, shape: Shape, joints: int) -> str:
             f"for (int n = 0; n < {count}; ++n)"
             f" w[n] = ((const uint4*)(weights + {weights}))[(step * {count} + n) * 32 + lane];",
         ]
-        for part, words in (("low", "x y"), ("high", "z w"), ("high", "x y")):
-            b0, b1 = words.split()
+        product = "on_tensor_cores::" + ("tf32" if first else "half")
+        for part, b0, b1 in (("low", "x", "y"), ("high", "z", "w"), ("high", "x", "y")):
             text += [
                 "#pragma unroll",
-                f"for (int n = 0; n < {count}; ++n)",
-                "#pragma unroll",
-                f"for (int m = 0; m < tiles; ++m) {product}({y}[m][n], {part}[m], w[n].{b0}, w[n].{b1});",
+                f"for (int n = 0; n < {count}; ++n) {product}({y}[n], {part}, w[n].{b0}, w[n].{b1});",
             ]
         text += [
             "}",
             "#pragma unroll",
-            "for (int m = 0; m < tiles; ++m)",
-            "#pragma unroll",
             f"for (int n = 0; n < {count}; ++n) {{",
-            f"activate({y}[m][n][0], {y}[m][n][1], {shape.scales[layer]!r}f);",
-            f"activate({y}[m][n][2], {y}[m][n][3], {shape.scales[layer]!r}f);",
+            f"activate({y}[n][0], {y}[n][1], {shape.scales[layer]!r}f);",
+            f"activate({y}[n][2], {y}[n][3], {shape.scales[layer]!r}f);",
             "}",
         ]
     last, bias = shape.places[len(shape.units)]
     y, count = f"y{len(shape.units) - 1}", shape.units[-1] // 8
     text += [
-        "#pragma unroll",
-        "for (int joint = 0; joint < joints; ++joint) {",
-        "float sums[4] = {0.0f, 0.0f, 0.0f, 0.0f};",
+        "sums[0] = sums[1] = 0.0f;",
         "#pragma unroll",
         f"for (int n = 0; n < {count}; ++n) {{",
         f"const float2 w = *(const float2*)(weights + {last} + 8 * n + 2 * t);",
-        "#pragma unroll",
-        "for (int i = 0; i < 4; ++i) {",
-        f"const float* x = {y}[2 * joint + i / 2][n] + 2 * (i & 1);",
-        "sums[i] = __fmaf_rn(x[0], w.x, __fmaf_rn(x[1], w.y, sums[i]));",
-        "}",
+        f"sums[0] = __fmaf_rn({y}[n][0], w.x, __fmaf_rn({y}[n][1], w.y, sums[0]));",
+        f"sums[1] = __fmaf_rn({y}[n][2], w.x, __fmaf_rn({y}[n][3], w.y, sums[1]));",
         "}",
         "#pragma unroll",
-        "for (int i = 0; i < 4; ++i) {",
+        "for (int i = 0; i < 2; ++i) {",
         "sums[i] += __shfl_xor_sync(0xffffffffu, sums[i], 1);",
         "sums[i] += __shfl_xor_sync(0xffffffffu, sums[i], 2);",
-        "}",
-        "const float own = t == 0 ? sums[0] : t == 1 ? sums[1] : t == 2 ? sums[2] : sums[3];  // of row 8 t + g",
-        f"found[joint] = __shfl_sync(0xffffffffu, own, 4 * (lane & 7) + (lane >> 3)) + weights[{bias}];",
+        f"sums[i] += weights[{bias}];",
         "}",
         "}",
         "};",

@@ -86,9 +86,11 @@ int main()
     for (int lane = 0; lane < 32; ++lane)
         threads.emplace_back([&, lane] {
             threadIdx.x = lane;
-            float each[JOINTS];
-            network::torques(staged.data(), weights.data(), each);
-            for (int joint = 0; joint < JOINTS; ++joint) found[32 * joint + lane] = each[joint];
+            for (int tile = 0; tile < 2 * JOINTS; ++tile) {
+                float sums[2];
+                network::tile(staged.data() + tile / 2 * (STAGED / JOINTS) + 16 * (tile % 2), weights.data(), sums);
+                if (lane % 4 < 2) found[16 * tile + lane / 4 + 8 * (lane % 4)] = sums[lane % 4];
+            }
         });
     for (auto& each : threads) each.join();
     fwrite(found.data(), 4, found.size(), stdout);
@@ -97,7 +99,7 @@ int main()
 
 
 def run_network(definition, weights, staged, folder):
-    """Return what ``network::torques`` of a definition finds [joint, row], from ``staged`` [joint, input, PITCH]."""
+    """Return what ``network::tile`` of a definition finds [joint, row], from ``staged`` [joint, input, PITCH]."""
     if shutil.which("g++") is None:
         pytest.skip("there is no g++ to compile device code for the host")
     sizes = {"WEIGHTS": weights.size, "STAGED": staged.size, "JOINTS": len(staged)}

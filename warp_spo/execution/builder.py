@@ -135,7 +135,8 @@ class Builder:
         room = self.room(wide, whole=whole)
         given = stores, everything, job.shapes, more, sent, warps, self.run.dtype
         before = tuple(code for code, _ in self.before) if SUBSTEPS in job.shapes else ()
-        return staging.choose_layout(*given, *ways, self.relays, room, wide, before)
+        helpers = self.plan.helpers(warps) if before else 0
+        return staging.choose_layout(*given, *ways, self.relays, room, wide, before, helpers)
 
     def room(self, wide: bool = False, whole: bool = False) -> int:
         """Bytes of shared memory that a block may have: for as many scalars in float64 as in float32 if the GPU can.
@@ -199,7 +200,7 @@ class Builder:
             rows,
             fields,
             tuple(held.values()),
-            layout.warps,
+            layout.warps + layout.helpers,
             layout.block,
             operations,
             result.slots,

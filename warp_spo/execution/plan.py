@@ -37,6 +37,7 @@ SHORT_ROWS = 10  # dofs up to which a thread's own row is read as fast as throug
 LONG_ROWS = 24  # in segments; longer rows come in together already at fewer worlds
 FEW_RESULTS = 2  # short ones that a thread writes by itself
 MOST_WARPS = 16
+MOST_TEAM = 8  # warps of a team with helpers: a multiprocessor has registers for eight whose threads take 255
 NODE_WORLDS = 1024  # of a CPU, beyond which a launch for each level only takes a large workspace
 DEEPEST = 12  # dofs from a root to a leaf, a free hinge one, up to which velocity terms that come first are as accurate
 VELOCITIES_FIRST = {"tree": {"float32": HELD, "float64": HELD}, "segment": SPILLS}  # dofs beyond which they are faster
@@ -237,6 +238,14 @@ class Plan:
         """
         most = SPILLS["float32"] if granularity == "segment" else HELD
         return not self.device.cuda or self.dofs <= most or self.worlds <= WARP_SIZE * self.device.multiprocessors
+
+    def helpers(self, warps: int) -> int:
+        """How many warps more than its ``warps`` a team has for work that others wait for, such as learned actuators.
+
+        They have as many registers as the others, so that there are some where each team has a multiprocessor.
+        """
+        alone = self.device.cuda and self.worlds <= WARP_SIZE * self.device.multiprocessors
+        return max(0, MOST_TEAM - warps) if alone and warps > 1 else 0
 
     def runs_beside(self, routine: Routine) -> bool:
         """Whether a routine that others do not wait for runs on a second stream beside them.

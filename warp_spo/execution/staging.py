@@ -51,6 +51,7 @@ def choose_layout(
     room: int,
     wide: bool = False,
     before: tuple[Before, ...] = (),
+    helpers: int = 0,
 ) -> KernelLayout:
     """Return the first layout in the order of preference that fits into shared memory.
 
@@ -68,7 +69,7 @@ def choose_layout(
         relays: a result that does not fit into shared memory may wait in its own rows, see ``kernels.long_results``.
         room: the bytes of shared memory that a block may have.
         wide: there is room for long results as they are, without a table of their distinct values.
-        before: code that runs before each substep.
+        before: code that runs before each substep. helpers: warps of a team that run nothing else.
 
     Returns:
         The first layout that fits into ``room``; if none does, the last one.
@@ -106,13 +107,14 @@ def choose_layout(
             result=result,
             messages=messages,
             warps=warps,
-            block=WARP_SIZE * warps,
+            block=WARP_SIZE * (warps + helpers),
             further=other_results,
             further_staged=together,
             cached=entries,
             numbers=numbers,
             repeats=SUBSTEPS in shapes,
             before=before,
+            helpers=helpers,
         )
         for rows_staged, result in ways
         for together in ((True, False) if other_results and result.way in (IN_PLACE, STAGED) else (False,))

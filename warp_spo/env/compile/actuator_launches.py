@@ -25,7 +25,6 @@ BLOCK = 128  # threads
 JOINED_ON = ("cuda",)  # kinds of devices on which the kernel of the step evaluates networks; on a CPU nothing is gained
 MOST_JOINED = 4096  # products of a network whose weights stand in the text of the step's kernel; more is much code
 TENSOR_CORES = True  # layers of networks with bounded activations, on GPUs
-TOGETHER = 3  # joints whose layers a warp evaluates side by side in the kernel of the step
 
 
 class ActuatorLaunches:
@@ -82,7 +81,7 @@ class ActuatorLaunches:
             arrays = {name: buffers[name].warp() for name in ARRAYS[:-1]}
             self._kernels.append((torques(joints, entries, BLOCK), list(arrays.values()), len(hinges)))
             self._joints.append(joints)
-            code = before_substep(joints, number, TOGETHER)
+            code = before_substep(joints, number)
             self._before.append((code, {f"{name}_{number}": arrays[name] for name in OWN}))
 
     def join(self, dyn: Dynamics, acts: bool, delays: bool, passes: int | None) -> bool:

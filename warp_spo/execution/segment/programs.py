@@ -263,7 +263,7 @@ class _SegmentProgram:
                 fits = blocks * (layout.shared_bytes(self.run.dtype) + RESERVED) <= self.plan.device.shared_bytes
                 if registers >= needed and fits:
                     return registers
-        return self._shared_registers(self.schedule.warps)
+        return self._shared_registers(self.schedule.warps + layout.helpers)
 
     def _shared_registers(self, warps: int) -> int:
         """Return how many registers a thread has if a multiprocessor holds so many warps, a multiple of 8.
