@@ -222,14 +222,6 @@ def test_gradients_that_do_not_exist_have_names(device):
         loss(dyn, tensors, contact_f=torch.zeros_like(force, requires_grad=True))
     loss(dyn, tensors, contact_f=force)
     assert (force[:, 0, 2] > 0.0).any()
-    balls = [spo.Contact(body, sphere=((0, 0, 0), 0.1), other=other) for body, other in ((0, None), (1, 0))]
-    bodies = [spo.Body(1.0, inertia=0.01 * np.eye(3)) for _ in range(2)]
-    pair = spo.Scene(bodies, [spo.Hinge("free", -1, body) for body in range(2)], contacts=balls, ground=spo.Plane())
-    q = torch.tensor(pair.neutral_q[None], dtype=torch.float32, requires_grad=True)
-    with pytest.raises(
-        spo.UnsupportedError, match="contact between bodies is not supported; leave out contacts with other="
-    ):
-        spo.Dynamics(pair, 1, "cpu").step(q, torch.zeros((1, 12)), None, H)
 
 
 def test_values_without_entries_have_gradients_without_entries(device):
