@@ -77,7 +77,7 @@ def pytest_collection_finish(session):
     if not wp.is_cuda_available() and not session.config.getoption("--optimized"):
         for name, module in list(sys.modules.items()):
             if name.startswith("newton."):
-                wp.set_module_options({"optimization_level": 0}, module)
+                wp.set_module_options({"optimization_level": 0, "fuse_fp": False}, module)  # the header of our own
 
 
 @pytest.fixture(scope="session")
