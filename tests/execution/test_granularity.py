@@ -25,7 +25,6 @@ from support.granularity_scenes import (
 from support.quick import slow_unless
 from support.routines import ROUTINES
 
-
 WHOLE = ("every kind", "arm", "fixed", "hand", "massless", "three roots")
 """Scenes that a quick run takes by whole trees, too: every hinge, a robot, fixed and massless links, several roots."""
 
