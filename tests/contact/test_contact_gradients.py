@@ -95,7 +95,7 @@ def test_gradients_are_differences(name):
 BY = ("q", "qd", "contact_friction")
 
 
-@pytest.mark.parametrize("passes", [1, 4])
+@pytest.mark.parametrize("passes", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_any_number_of_passes_is_differentiated(passes):
     scene, a = case("rough")
     errors = contact_gradients.errors(scene, a, H, passes, names=BY)

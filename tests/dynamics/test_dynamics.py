@@ -43,7 +43,7 @@ def _twin(name, worlds, dtype, device, varied):
 @pytest.mark.parametrize(
     ("name", "dtype"),
     slow_unless(
-        [*((name, "float64") for name in FEW), ("tree20", "float32"), ("arm", "float32")],
+        [*((name, "float64") for name in FEW), ("arm", "float32")],
         itertools.product(SCENES, ["float64", "float32"]),
     ),
 )

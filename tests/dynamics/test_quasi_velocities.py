@@ -9,6 +9,7 @@ from support.flexible_scenes import Traced
 from support.flexible_trees import TREES
 from support.flexible_trees import states as flexible_states
 from support.flexible_trees import tree as flexible_tree
+from support.quick import slow_unless
 from warp_spo.examples import quasi_velocities as example
 from warp_spo.reference.dense import Dense
 
@@ -107,7 +108,7 @@ def test_the_example_keeps_the_energy(device, tmp_path):
     assert "in nu, all 2 worlds" in (tmp_path / "nu.svg").read_text()
 
 
-@pytest.mark.parametrize("name", TREES)
+@pytest.mark.parametrize("name", slow_unless(["free"], TREES))
 def test_flexible_trees(name):
     """Energy, the way back, no work, and the rate of nu along forward dynamics, where links share modal coordinates."""
     scene = flexible_tree(name)

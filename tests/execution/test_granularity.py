@@ -25,6 +25,9 @@ from support.granularity_scenes import (
 from support.quick import slow_unless
 from support.routines import ROUTINES
 
+WHOLE = ("every kind", "arm", "fixed", "hand", "massless", "three roots")
+"""Scenes that a quick run takes by whole trees, too: every hinge, a robot, fixed and massless links, several roots."""
+
 
 def cases():
     """(scene, granularity, dtype, operation), slow where a quick run leaves it out."""
@@ -34,6 +37,7 @@ def cases():
             for dtype in DTYPES:
                 for operation in OPERATIONS if granularity == "tree" else (*SEGMENTED, "bias_force"):
                     quick = dtype == QUICK[name][0] and operation in QUICK[name][1]
+                    quick &= granularity == "segment" or name in WHOLE
                     marks = [] if quick else [pytest.mark.slow]
                     found.append(pytest.param(name, granularity, dtype, operation, marks=marks))
     return found
