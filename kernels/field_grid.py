@@ -1,7 +1,8 @@
 """Where shapes touch the grid of a height field, as :mod:`warp_spo.reference.field_grid` says: loops over candidates.
 
 A search reads the table of cells, four corners each, and writes four rows of nine numbers. Its loops are not unrolled,
-so that their code is short however many points of the grid lie under a shape.
+so that their code is short however many points of the grid lie under a shape. Most shapes are above most of what lies
+under them: loads of the heights of a row do not wait for each other, and what is too low is left out at once.
 """
 
 import functools
@@ -15,7 +16,7 @@ from .elementary import C_TYPE
 NAME = "grid_search"
 RULES = {
     "OUTWARD": 1e-3, "TIE": 1e-6, "DOWN": 0.5, "ACROSS": 0.17, "BESIDE": 0.35, "SLACK": 0.5, "PARALLEL": 1e-6,
-    "FAR": 1e30, "APART": 0.94 * 0.94, "ABOVE": 0.5, "STANDS": 0.7, "PI": math.pi,
+    "FAR": 1e30, "APART": 0.94 * 0.94, "STANDS": 0.7, "PI": math.pi,
     "LEAN": math.tan(hull_corners.LEAN), "NEARER": 1.0 - 1e-6, "UPRIGHT": 1e-8,
 }  # fmt: skip
 KINDS = {
@@ -29,6 +30,7 @@ KINDS = {
     "ROW": 9,
     "STEPS": 2,
     "CHOSEN": hull_corners.ROWS,
+    "CELLS": 16,
 }
 
 
@@ -40,7 +42,9 @@ def definitions(code: str, T: type) -> list[str]:
 @functools.cache
 def native(T: type) -> str:
     """Return the definition of ``grid_search`` for scalars of type ``T``."""
-    text, number = NATIVE.replace("REAL", C_TYPE[T]).replace("LOOP\n", "#pragma unroll 1\n"), "f" * (T is wp.float32)
+    text, number = NATIVE.replace("REAL", C_TYPE[T]), "f" * (T is wp.float32)
+    for word, count in {"LOOP": 1, "SOME": 4}.items():
+        text = text.replace(word + "\n", f"#pragma unroll {count}\n")
     for name, value in RULES.items():
         text = text.replace(name, f"{value!r}{number}")
     for name, kind in KINDS.items():
@@ -56,7 +60,7 @@ struct grid_search
     {
         const REAL* cells;
         const REAL *centre, *axes, *sizes;
-        REAL cell[2];
+        REAL cell[2], reach[3], bottom; // what is below the bottom is not looked at
         int count[2], low[2], high[2];
 
         CUDA_CALLABLE inline Field(const REAL* table, const REAL* asked)
@@ -67,6 +71,13 @@ struct grid_search
                 cell[f] = asked[16 + f];
                 count[f] = (int)asked[18 + f];
             }
+            const bool round = sizes[1] == 0; // a capsule, whose half length is that of its axis
+            const REAL half[3] = {sizes[0], round ? sizes[0] : sizes[1], sizes[2] + (round ? sizes[0] : 0)};
+            for (int f = 0; f < 3; ++f) {
+                reach[f] = 0;
+                for (int k = 0; k < 3; ++k) reach[f] += on::absolute(axes[3 * k + f]) * half[k];
+            }
+            bottom = centre[2] - reach[2] - asked[20];
         }
 
         CUDA_CALLABLE inline REAL height(int i, int j) const { return cells[4ll * (i * count[1] + j)]; }
@@ -94,26 +105,30 @@ struct grid_search
             if (around && last < b) ++last;
         }
 
-        // Whether the shape is above the field by more than ABOVE of its size; a capsule's half length is that of its
-        // axis.
+        // Whether a grid point and its lines along x and y are all below the bottom.
+        CUDA_CALLABLE inline bool is_low(int i, int j) const
+        {
+            const REAL* at = cells + 4ll * (i * count[1] + j);
+            return at[0] < bottom && at[1] < bottom && at[2] < bottom;
+        }
+
+        // The same of the points from ``first`` to ``last`` of a row: loads that do not wait for each other.
+        CUDA_CALLABLE inline bool is_row_low(int i, int first, int last) const
+        {
+            bool low = true;
+            SOME
+            for (int j = first; j <= last; ++j) low &= is_low(i, j);
+            return low;
+        }
+
+        // Whether all of the field under the shape is below the bottom.
         CUDA_CALLABLE inline bool is_far() const
         {
-            const bool round = sizes[1] == 0;
-            const REAL half[3] = {sizes[0], round ? sizes[0] : sizes[1], sizes[2] + (round ? sizes[0] : 0)};
-            REAL reach[3];
             int first[2], last[2];
-            for (int f = 0; f < 3; ++f) {
-                reach[f] = 0;
-                for (int k = 0; k < 3; ++k) reach[f] += on::absolute(axes[3 * k + f]) * half[k];
-                if (f < 2) between(centre[f] - reach[f], centre[f] + reach[f], f, true, first[f], last[f]);
-            }
-            const REAL lowest = centre[2] - reach[2] - ABOVE * (half[0] + half[1] + half[2]);
+            for (int f = 0; f < 2; ++f) between(centre[f] - reach[f], centre[f] + reach[f], f, true, first[f], last[f]);
             LOOP
-            for (int i = first[0]; i <= last[0]; ++i) {
-                LOOP
-                for (int j = first[1]; j <= last[1]; ++j)
-                    if (!(height(i, j) < lowest)) return false;
-            }
+            for (int i = first[0]; i <= last[0]; ++i)
+                if (!is_row_low(i, first[1], last[1])) return false;
             return true;
         }
 
@@ -220,6 +235,7 @@ struct grid_search
                     if (on::absolute(t) > half || !(place >= 0 && place <= field.count[o] - 1)) continue;
                     const int m = (int)place < field.count[o] - 2 ? (int)place : field.count[o] - 2;
                     const int i = f == 0 ? line : m, j = f == 0 ? m : line;
+                    if (field.is_low(i, j)) continue;
                     const REAL rises = field.rises(i, j, f), rise = rises / field.cell[o];
                     const REAL slope = (along[2] - aside * rise) / across;
                     const REAL up = on::inverse_root(1 + rise * rise + slope * slope);
@@ -251,6 +267,7 @@ struct grid_search
         for (int i = field.low[0]; i <= field.high[0]; ++i) {
             LOOP
             for (int j = field.low[1]; j <= field.high[1]; ++j) {
+                if (field.is_low(i, j)) continue;
                 REAL q[3], depth = FAR, side = FAR, normal[3] = {0, 0, 0}, offset = 0;
                 shape.from_middle(i, j, q);
                 int face = -1;
@@ -294,6 +311,7 @@ struct grid_search
         for (int i = field.low[0]; i <= field.high[0]; ++i) {
             LOOP
             for (int j = field.low[1]; j <= field.high[1]; ++j) {
+                if (field.is_low(i, j)) continue;
                 REAL q[3], depth = FAR, side = FAR;
                 shape.from_middle(i, j, q);
                 int face = -1;
@@ -346,6 +364,7 @@ struct grid_search
         for (int i = field.low[0]; i <= field.high[0]; ++i) {
             LOOP
             for (int j = field.low[1]; j <= field.high[1]; ++j) {
+                if (field.is_low(i, j)) continue;
                 REAL q[3];
                 shape.from_middle(i, j, q);
                 const REAL side = radius - on::sqrt(q[0] * q[0] + q[1] * q[1]);
@@ -388,6 +407,7 @@ struct grid_search
             LOOP
             for (int j = first[1]; j < last[1]; ++j) {
                 const REAL* h = field.cells + 4ll * (i * field.count[1] + j);
+                if (field.is_low(i, j) && h[3] < field.bottom) continue;
                 const REAL run = h[2] - h[0], rise = h[1] - h[0], twist = h[0] - h[1] - h[2] + h[3];
                 const REAL x = (run + twist / 2) / field.cell[0], y = (rise + twist / 2) / field.cell[1];
                 if (x * x + y * y > 1) continue;
@@ -426,7 +446,7 @@ struct grid_search
     {
         const Field field(table, asked);
         Best best(out);
-        if (!field.is_far()) beside_axis(field, best, 0, 0, nullptr);
+        beside_axis(field, best, 0, 0, nullptr);
     }
 
     // ``kind`` is SIDE for a cylinder, which has faces at the ends of its axis, else 0; ``sideways``: as for rims.
@@ -442,8 +462,10 @@ struct grid_search
         }
         LOOP
         for (int i = low[0]; i <= high[0]; ++i) {
+            if (field.is_row_low(i, low[1], high[1])) continue;
             LOOP
             for (int j = low[1]; j <= high[1]; ++j) {
+                if (field.is_low(i, j)) continue;
                 const REAL w[3] = {c[0] - i * field.cell[0], c[1] - j * field.cell[1], c[2] - field.height(i, j)};
                 const REAL along = field.along(2, w[0], w[1], w[2]);
                 LOOP
@@ -554,35 +576,34 @@ struct grid_search
             at[f] = x > -ring ? (x < most ? x : most) : -ring;
             middle[f] = (int)(at[f] + ring + (REAL)0.5) - ring;
         }
-        REAL first[3] = {0, 0, 0}, square = 0;
-        out[2] = out[3] = 0;
+        REAL away[CELLS][3], squares[CELLS]; // of each cell's nearest point; a square that is negative: inside
+        int nearest = 0;
         LOOP
-        for (int round = 0; round < 1 + (int)asked[9]; ++round) { // the second looks away from what the first found
-            REAL least = FAR;
-            int best[2] = {0, 0};
-            LOOP
-            for (int n = 0; n < 4 * ring * ring; ++n) {
-                const int each[2] = {middle[0] - ring + n / (2 * ring), middle[1] - ring + n % (2 * ring)};
-                levelled(cells, each, last, corners);
-                const Foot foot(
-                    corners, size, (at[0] - each[0]) * size[0], (at[1] - each[1]) * size[1], asked[3], STEPS);
-                if (round) {
-                    const REAL turned = foot.away[0] * first[0] + foot.away[1] * first[1] + foot.away[2] * first[2];
-                    if (!foot.outside || !(turned < 0 || turned * turned < APART * foot.square * square)) continue;
-                }
-                if (foot.square < NEARER * least) least = foot.square, best[0] = each[0], best[1] = each[1];
-            }
-            out[2 * round] = best[0], out[2 * round + 1] = best[1];
-            if (round) {
-                if (!(least < FAR)) out[4] = 0;
-                continue;
-            }
-            levelled(cells, best, last, corners);
-            const Foot foot(
-                corners, size, (at[0] - best[0]) * size[0], (at[1] - best[1]) * size[1], asked[3], STEPS + 1);
-            for (int x = 0; x < 3; ++x) first[x] = foot.away[x];
-            square = foot.square, out[4] = foot.outside;
+        for (int n = 0; n < 4 * ring * ring; ++n) {
+            const int each[2] = {middle[0] - ring + n / (2 * ring), middle[1] - ring + n % (2 * ring)};
+            levelled(cells, each, last, corners);
+            const Foot foot(corners, size, (at[0] - each[0]) * size[0], (at[1] - each[1]) * size[1], asked[3], STEPS);
+            for (int x = 0; x < 3; ++x) away[n][x] = foot.away[x];
+            squares[n] = foot.outside ? foot.square : -foot.square;
+            if (!n || foot.square < NEARER * on::absolute(squares[nearest])) nearest = n;
         }
+        const int best[2] = {middle[0] - ring + nearest / (2 * ring), middle[1] - ring + nearest % (2 * ring)};
+        out[0] = best[0], out[1] = best[1], out[2] = out[3] = 0;
+        levelled(cells, best, last, corners);
+        const Foot first(
+            corners, size, (at[0] - best[0]) * size[0], (at[1] - best[1]) * size[1], asked[3], STEPS + 1);
+        out[4] = first.outside;
+        if (!(int)asked[9]) return;
+        REAL least = FAR; // the second looks away from what the first found
+        LOOP
+        for (int n = 0; n < 4 * ring * ring; ++n) {
+            const REAL square = squares[n], *w = away[n];
+            const REAL turned = w[0] * first.away[0] + w[1] * first.away[1] + w[2] * first.away[2];
+            const bool aside = turned < 0 || turned * turned < APART * square * first.square;
+            if (!(square > 0) || !aside || !(square < NEARER * least)) continue;
+            least = square, out[2] = middle[0] - ring + n / (2 * ring), out[3] = middle[1] - ring + n % (2 * ring);
+        }
+        if (!(least < FAR)) out[4] = 0;
     }
 
     // The hull's own ``count`` numbers are its corners; place and presence of those that touch, see hull_corners.

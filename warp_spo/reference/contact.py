@@ -422,7 +422,7 @@ class ContactStep:
         shape = "corners" if support.kind == "hull corner" else support.kind.partition(" ")[0]
         heights = ground.heights.reshape(-1, *ground.heights.shape[-2:])
         numbers = [which * heights[0].size, *(middle - ground.origin - moved), *(support.axes @ turn.T).ravel()]
-        numbers += [*support.sizes, *ground.cells, *heights[0].shape, *support.table]
+        numbers += [*support.sizes, *ground.cells, *heights[0].shape, np.sum(support.sizes), *support.table]
         return find(shape, heights.ravel(), numbers)[support.number]
 
     def _is_there(self, point, up):

@@ -25,7 +25,6 @@ DOWN = 0.5  # by how much a face or an edge looks down at least: the cosine of 6
 ACROSS = 0.17  # sine of the angle between an edge and a grid line, seen from above, at least
 BESIDE = 0.35  # cosine of the angle between a face's normal and the ground's below which its edges may carry
 SLACK = 0.5  # share of half the smallest size by which a depth may exceed the way out to the side
-ABOVE = 0.5  # of its size by which a shape that is not looked at is above the ground
 PARALLEL = 1e-6  # square of the sine below which an axis and a grid line are parallel
 
 
@@ -36,30 +35,33 @@ def find(shape, heights, numbers):
 
     Args:
         heights: of all fields, row after row. numbers: of the first height of the field; the shape's middle from there
-            (3) [m]; its axes, one a row (9); its sizes (3) [m]; the cell along x and y [m]; points along x and y; of
-            a hull the number of faces, their normals and distances from the middle, and the edges, see _polyhedron;
+            (3) [m]; its axes, one a row (9); its sizes (3) [m]; the cell along x and y [m]; points along x and y; by
+            how much the field may be below the shape [m], beyond which it is not looked at; of a hull the number of
+            faces, their normals and distances from the middle, and the edges, see _polyhedron;
             of corners these, along the axes.
     """
     numbers = np.asarray(numbers, dtype=np.float64)
     if shape == "sphere":
         return _sphere(heights, numbers)
-    first, centre, axes, sizes, cell, counts, table = np.split(numbers, [1, 4, 13, 16, 18, 20])
+    first, centre, axes, sizes, cell, counts, below, table = np.split(numbers, [1, 4, 13, 16, 18, 20, 21])
     counts = counts.astype(int)
     field = heights[int(first[0]) :][: counts[0] * counts[1]].reshape(counts)
     axes = axes.reshape(3, 3)
     if shape == "corners":
         return hull_corners.on_field(field, cell, centre, axes, table.reshape(-1, 3))
-    if _is_far(field, cell, centre, axes, sizes):
-        return _choose([])
-    return SHAPES[shape](field, cell, centre, axes, sizes, table)
-
-
-def _is_far(field, cell, centre, axes, sizes):
-    """Return whether a shape is above the field by more than ABOVE of its size."""
     half = np.array([sizes[0], sizes[0], sizes[2] + sizes[0]]) if sizes[1] == 0.0 else sizes
-    reach = np.abs(axes.T) @ half
-    (i, k), (j, m) = (_between(centre[f] - reach[f], centre[f] + reach[f], cell[f], field.shape[f])[2:] for f in (0, 1))
-    return bool((field[i : k + 1, j : m + 1] < centre[2] - reach[2] - ABOVE * half.sum()).all())
+    bottom = centre[2] - np.abs(axes.T[2]) @ half - below[0]
+    found = SHAPES[shape](field, cell, centre, axes, sizes, table)
+    return _choose([each for each in found if not _is_low(field, each[3], bottom)])
+
+
+def _is_low(field, row, bottom):
+    """Return whether a grid point and its lines, or the cell of a rim, are all below ``bottom``."""
+    kind, i, j = row[0], int(row[1]), int(row[2])
+    cell = field[i : i + 2, j : j + 2]
+    return bool(
+        (cell < bottom).all() if kind == RIMS else (cell.ravel()[: cell.size - (cell.size == 4)] < bottom).all()
+    )
 
 
 def _choose(candidates):
@@ -88,14 +90,14 @@ def _box(field, cell, centre, axes, half, table):
         for b, a in ((b, a) for b in (-1.0, 1.0) for a in (-1.0, 1.0)):
             seat = half * (a * first + b * second)
             edges.append((seat, np.eye(3)[k], half[k], a * first, b * second))
-    return _choose(_polyhedron(field, cell, centre, axes, np.abs(axes.T) @ half, SLACK * half.min(), faces, edges))
+    return _polyhedron(field, cell, centre, axes, np.abs(axes.T) @ half, SLACK * half.min(), faces, edges)
 
 
 def _hull(field, cell, centre, axes, half, table):
     count, rest = int(table[0]), table[1:]
     faces = [(row[:3], row[3]) for row in rest[: 4 * count].reshape(-1, 4)]
     edges = [(row[:3], row[3:6], row[6], row[7:10], row[10:13]) for row in rest[4 * count :].reshape(-1, 13)]
-    return _choose(_polyhedron(field, cell, centre, axes, np.abs(axes.T) @ half, SLACK * half.min(), faces, edges))
+    return _polyhedron(field, cell, centre, axes, np.abs(axes.T) @ half, SLACK * half.min(), faces, edges)
 
 
 def _polyhedron(field, cell, centre, axes, reach, slack, faces, edges, round_by=np.inf):
@@ -174,11 +176,11 @@ def _cylinder(field, cell, centre, axes, sizes, table):
         beside = _beside_axis(field, cell, centre, axes[2], radius, half, slack, across)
         edges = [edge for end in (-1.0, 1.0) for edge in _rim_edges(radius, half, end)]
         sides = lambda q: (q[2], across @ (axes.T @ q))  # noqa: E731
-        return _choose([*beside, *_edges(field, cell, centre, axes, slack, edges, sides), *rims])
+        return [*beside, *_edges(field, cell, centre, axes, slack, edges, sides), *rims]
     end = -1.0 if axes[2, 2] > 0.0 else 1.0
     face, edges = (np.array([0.0, 0.0, end]), half), _rim_edges(radius, half, end)
     found = _polyhedron(field, cell, centre, axes, np.abs(axes.T) @ sizes, slack, [face], edges, radius)
-    return _choose([*found, *rims])
+    return [*found, *rims]
 
 
 def _rim_edges(radius, half, end):
@@ -238,7 +240,7 @@ def _in_cell(corners, cell, s, t, z):
 
 def _capsule(field, cell, centre, axes, sizes, table):
     radius, _, half = sizes
-    return _choose(_beside_axis(field, cell, centre, axes[2], radius, half))
+    return _beside_axis(field, cell, centre, axes[2], radius, half)
 
 
 def _beside_axis(field, cell, centre, axis, radius, half, slack=None, across=None):

@@ -28,6 +28,7 @@ class Shape(NamedTuple):
     Attributes:
         kind: one of GRIDS, or HULL_CORNER. centre: its middle, from the field's first point.
         axes: one each, inertial axes. sizes, table: those of its supports. radius: by which it is larger [m].
+        below: by how much the field may be below it [m]; beyond, it is not looked at.
     """
 
     kind: str
@@ -35,6 +36,7 @@ class Shape(NamedTuple):
     axes: list[Vector]
     sizes: list[Value]
     radius: Value
+    below: Value
     table: tuple[float, ...] = ()
 
 
@@ -59,7 +61,7 @@ def search_field(
     if ground.count > 1:
         first = floor(clamp(place.field, ground.count - 1.0)) * float(rows * columns)
     asked = [first, *shape.centre, *(x for axis in shape.axes for x in axis), *shape.sizes]
-    asked += [*ground.cells, float(rows), float(columns), *shape.table]
+    asked += [*ground.cells, float(rows), float(columns), shape.below, *shape.table]
     return search(graph, GROUND, name, asked, count)
 
 

@@ -56,6 +56,7 @@ if TYPE_CHECKING:
 
 ARMS = 8  # spheres of a segment up to which their arms are kept, see docs/contact_measured.md
 STANDING = (0.0, 0.0, 1.0)  # normal of the ground in a body's frame for which weights of points that move are taken
+FASTER, REACHES = 5.0, 2.0  # speed that a step may add to a shape's [m/s]; way per speed and step that is looked down
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
 
 
@@ -157,12 +158,14 @@ def place_points(
     qd: Entry,
     oriented: bool = False,
     branches: bool = False,
+    gaps: bool = True,
     carry: Callable[[Link, ContactLinkMotion], ContactLinkMotion] | None = None,
 ) -> list[TracedContactPoint]:
     """Return the contact points that a trace works on, one for each surface that a point may touch.
 
     ``oriented``: with the inertial directions x, y, z in the axes of their links. ``branches``: code may leave out
-    points where their surface is not near. ``carry``: returns what points and further links read of a link, on the way
+    points where their surface is not near. ``gaps``: of shapes over a field are also found where they do not close
+    within the step. ``carry``: returns what points and further links read of a link, on the way
     to any point of the scene; None: what was computed.
     """
     scene = trace.links.scene
@@ -197,7 +200,8 @@ def place_points(
             assert isinstance(ground, HeightField) and point.support is not None
             if point.contact not in searches:
                 at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
-                shape = _shape_over(trace, number, ground, place_of_ground, at, toward, radius)
+                below = None if gaps else joint_laws.h * _speed_bound(trace, number, mine.travel, centre)
+                shape = _shape_over(trace, number, ground, place_of_ground, at, toward, radius, below)
                 searches[point.contact] = shape, find(trace.graph, ground, place_of_ground, shape)
             shape, rows = searches[point.contact]
             row = rows[ROW * point.support.number : ROW * (point.support.number + 1)]
@@ -341,14 +345,28 @@ def _shape_over(
     middle: list[Value],
     toward: list[Vector],
     radius: Value,
+    below: Value | None = None,
 ) -> Shape:
-    """Return the shape of a point over a field; ``middle``: of the shape, ``toward``: the inertial axes in its link."""
+    """Return the shape of a point over a field; ``middle``: of the shape, ``toward``: the inertial axes in its link.
+
+    ``below``: by how much the field may be below it; None: by its size.
+    """
     support = trace.links.scene.contact_points[number].support
     assert support is not None
     axes, sizes, _ = _support_values(trace, number)
     centre = Vector(x - place.origin[c] - ground.origin[c] for c, x in enumerate(middle))
     turned = [Vector(dot(way, axis) for way in toward) for axis in axes]
-    return Shape(support.kind, centre, turned, sizes, radius, support.table)
+    return Shape(support.kind, centre, turned, sizes, radius, total(sizes) if below is None else below, support.table)
+
+
+def _speed_bound(trace: Trace, number: int, twist: Twist, middle: Vector) -> Value:
+    """Return a bound of how fast a shape and the ground may come closer in the step, times REACHES.
+
+    ``twist``: of its link. ``middle``: of the shape in the link.
+    """
+    (w, v), (_, sizes, _) = twist, _support_values(trace, number)
+    speed = total(absolute(x) for x in v + cross(w, middle)) + total(absolute(x) for x in w) * total(sizes)
+    return REACHES * speed + FASTER
 
 
 def _place_support(trace: Trace, number: int, normal: Vector) -> SupportPlacement:
