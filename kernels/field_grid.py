@@ -31,7 +31,9 @@ KINDS = {
     "STEPS": 2,
     "CHOSEN": hull_corners.ROWS,
     "CELLS": 16,
+    "BATCH": 4,
 }
+BATCHES = {"OfBatch": "BATCH", "OfOne": "1"}  # cells whose nearest points are found side by side
 
 
 def definitions(code: str, T: type) -> list[str]:
@@ -42,9 +44,10 @@ def definitions(code: str, T: type) -> list[str]:
 @functools.cache
 def native(T: type) -> str:
     """Return the definition of ``grid_search`` for scalars of type ``T``."""
-    text, number = NATIVE.replace("REAL", C_TYPE[T]), "f" * (T is wp.float32)
-    for word, count in {"LOOP": 1, "SOME": 4}.items():
-        text = text.replace(word + "\n", f"#pragma unroll {count}\n")
+    feet = "\n\n".join(FEET.replace("NAME", name).replace("COUNT", count) for name, count in BATCHES.items())
+    text, number = NATIVE.replace("FEET_OF_CELLS", feet).replace("REAL", C_TYPE[T]), "f" * (T is wp.float32)
+    for word, count in {"LOOP": " 1", "SOME": " 8", "ALL": ""}.items():
+        text = text.replace(f" {word}\n", f"\n#pragma unroll{count}\n")
     for name, value in RULES.items():
         text = text.replace(name, f"{value!r}{number}")
     for name, kind in KINDS.items():
@@ -52,6 +55,57 @@ def native(T: type) -> str:
     return text
 
 
+FEET = r"""\
+    // The nearest points of some cells to a sphere's centre, found side by side, so that no operation waits for one of
+    // another cell: the ways from there to the centre, and whether that is above.
+    struct FeetNAME
+    {
+        REAL away[COUNT][3], square[COUNT];
+        bool outside[COUNT];
+
+        // ``h``: their corners. ``x``, ``y``: of the centre from the first one.
+        CUDA_CALLABLE inline FeetNAME(
+            const REAL (*h)[4], const REAL* cell, const REAL* x, const REAL* y, REAL z, int steps)
+        {
+            const REAL per_x = 1 / cell[0], per_y = 1 / cell[1];
+            REAL run[COUNT], rise[COUNT], twist[COUNT], above[COUNT], s[COUNT], t[COUNT];
+            ALL
+            for (int n = 0; n < COUNT; ++n) {
+                run[n] = (h[n][2] - h[n][0]) * per_x, rise[n] = (h[n][1] - h[n][0]) * per_y;
+                twist[n] = (h[n][0] - h[n][2] - h[n][1] + h[n][3]) * (per_x * per_y), above[n] = z - h[n][0];
+                s[n] = inside(x[n], cell[0]), t[n] = inside(y[n], cell[1]);
+            }
+            LOOP
+            for (int step = 0; step < steps; ++step) {
+                ALL
+                for (int n = 0; n < COUNT; ++n) {
+                    const REAL a = run[n] + twist[n] * t[n], b = rise[n] + twist[n] * s[n];
+                    const REAL w = above[n] - run[n] * s[n] - b * t[n];
+                    const REAL right_x = (x[n] - s[n]) + a * w, right_y = (y[n] - t[n]) + b * w;
+                    const REAL along_x = a * a + 1, along_y = b * b + 1, both = a * b;
+                    const REAL inverse = 1 / (along_x + b * b);
+                    if (step % 2 == 0) {
+                        const REAL next = inside(s[n] + (along_y * right_x - both * right_y) * inverse, cell[0]);
+                        t[n] = inside(t[n] + (right_y - both * (next - s[n])) / along_y, cell[1]);
+                        s[n] = next;
+                    } else {
+                        const REAL next = inside(t[n] + (along_x * right_y - both * right_x) * inverse, cell[1]);
+                        s[n] = inside(s[n] + (right_x - both * (next - t[n])) / along_x, cell[0]);
+                        t[n] = next;
+                    }
+                }
+            }
+            ALL
+            for (int n = 0; n < COUNT; ++n) {
+                const REAL a = run[n] + twist[n] * t[n], b = rise[n] + twist[n] * s[n];
+                away[n][0] = x[n] - s[n], away[n][1] = y[n] - t[n], away[n][2] = above[n] - run[n] * s[n] - b * t[n];
+                square[n] = away[n][0] * away[n][0] + away[n][1] * away[n][1] + away[n][2] * away[n][2];
+                outside[n] = away[n][2] - a * away[n][0] - b * away[n][1] > 0;
+            }
+        }
+
+        static CUDA_CALLABLE inline REAL inside(REAL x, REAL size) { return x > 0 ? (x < size ? x : size) : 0; }
+    };"""
 NATIVE = r"""
 struct grid_search
 {
@@ -112,24 +166,20 @@ struct grid_search
             return at[0] < bottom && at[1] < bottom && at[2] < bottom;
         }
 
-        // The same of the points from ``first`` to ``last`` of a row: loads that do not wait for each other.
-        CUDA_CALLABLE inline bool is_row_low(int i, int first, int last) const
-        {
-            bool low = true;
-            SOME
-            for (int j = first; j <= last; ++j) low &= is_low(i, j);
-            return low;
-        }
-
-        // Whether all of the field under the shape is below the bottom.
+        // Whether all of the field under the shape is below the bottom; loads do not wait for each other.
         CUDA_CALLABLE inline bool is_far() const
         {
             int first[2], last[2];
             for (int f = 0; f < 2; ++f) between(centre[f] - reach[f], centre[f] + reach[f], f, true, first[f], last[f]);
-            LOOP
-            for (int i = first[0]; i <= last[0]; ++i)
-                if (!is_row_low(i, first[1], last[1])) return false;
-            return true;
+            bool far = true;
+            int j = first[1];
+            SOME
+            for (int i = first[0]; i <= last[0];) {
+                far &= height(i, j) < bottom;
+                const bool ends = j == last[1];
+                i += ends, j = ends ? first[1] : j + 1;
+            }
+            return far;
         }
 
         // The axis k of the shape on the direction (x, y, z).
@@ -150,13 +200,19 @@ struct grid_search
             for (int n = 0; n < QUADRANTS * ROW; ++n) rows[n] = n % ROW == 3;
         }
 
+        CUDA_CALLABLE inline bool is_better(REAL depth, REAL u, REAL v) const
+        {
+            return depth + OUTWARD * (on::absolute(u) + on::absolute(v)) > score[quadrant(u, v)] + TIE;
+        }
+
+        static CUDA_CALLABLE inline int quadrant(REAL u, REAL v) { return (u > 0 ? 1 : 0) + (v > 0 ? 2 : 0); }
+
         // The row to write for a candidate, or none.
         CUDA_CALLABLE inline REAL* take(REAL depth, REAL u, REAL v)
         {
-            const int q = (u > 0 ? 1 : 0) + (v > 0 ? 2 : 0);
-            const REAL found = depth + OUTWARD * (on::absolute(u) + on::absolute(v));
-            if (!(found > score[q] + TIE)) return nullptr;
-            score[q] = found;
+            if (!is_better(depth, u, v)) return nullptr;
+            const int q = quadrant(u, v);
+            score[q] = depth + OUTWARD * (on::absolute(u) + on::absolute(v));
             return rows + ROW * q;
         }
     };
@@ -446,7 +502,7 @@ struct grid_search
     {
         const Field field(table, asked);
         Best best(out);
-        beside_axis(field, best, 0, 0, nullptr);
+        if (!field.is_far()) beside_axis(field, best, 0, 0, nullptr);
     }
 
     // ``kind`` is SIDE for a cylinder, which has faces at the ends of its axis, else 0; ``sideways``: as for rims.
@@ -462,44 +518,40 @@ struct grid_search
         }
         LOOP
         for (int i = low[0]; i <= high[0]; ++i) {
-            if (field.is_row_low(i, low[1], high[1])) continue;
             LOOP
             for (int j = low[1]; j <= high[1]; ++j) {
                 if (field.is_low(i, j)) continue;
                 const REAL w[3] = {c[0] - i * field.cell[0], c[1] - j * field.cell[1], c[2] - field.height(i, j)};
                 const REAL along = field.along(2, w[0], w[1], w[2]);
-                LOOP
+                ALL
                 for (int f = -1; f < 2; ++f) { // the grid point, its line along y, its line along x
                     REAL t = -along, s = 0, g[3] = {0, 0, 0};
+                    bool meets = true;
                     if (f >= 0) {
                         const int o = 1 - f;
-                        if ((f == 0 ? j : i) + 1 >= field.count[o]) continue;
                         g[0] = f == 0 ? 0 : field.cell[0], g[1] = f == 0 ? field.cell[1] : 0;
                         g[2] = field.rises(i, j, f);
                         const REAL square = g[0] * g[0] + g[1] * g[1] + g[2] * g[2];
                         const REAL both = field.along(2, g[0], g[1], g[2]);
                         const REAL of_line = g[0] * w[0] + g[1] * w[1] + g[2] * w[2];
                         const REAL spread = square - both * both;
-                        if (!(spread > PARALLEL * square)) continue;
                         t = (both * of_line - square * along) / spread;
                         s = (of_line + both * t) / square;
-                        if (!(s >= 0 && s <= 1)) continue;
+                        meets = (f == 0 ? j : i) + 1 < field.count[o] && spread > PARALLEL * square && s >= 0 && s <= 1;
                     }
-                    if (!(on::absolute(t) < half)) continue;
                     REAL away[3], squares = 0;
                     for (int x = 0; x < 3; ++x) {
                         away[x] = w[x] + t * axis[x] - s * g[x];
                         squares += away[x] * away[x];
                     }
-                    const REAL z = c[2] + t * axis[2];
-                    const bool outside = surface(field, c[0] + t * axis[0], c[1] + t * axis[1]) <= z;
-                    const REAL distance = on::sqrt(squares);
+                    const REAL distance = on::sqrt(squares), depth = kind ? radius - distance : -distance;
+                    const REAL v = kind ? -(sideways[0] * away[0] + sideways[1] * away[1]) : (REAL)0;
+                    if (!(meets && on::absolute(t) < half && best.is_better(depth, t, v))) continue;
+                    const bool outside = surface(field, c[0] + t * axis[0], c[1] + t * axis[1]) <= c[2] + t * axis[2];
                     const bool side = away[2] >= DOWN * distance
                         && radius - distance <= half - on::absolute(t) + slack;
                     if (outside && !(kind ? side : away[2] > 0)) continue;
-                    const REAL v = kind ? -(sideways[0] * away[0] + sideways[1] * away[1]) : (REAL)0;
-                    REAL* row = best.take(kind ? radius - distance : -distance, t, v);
-                    if (!row) continue;
+                    REAL* row = best.take(depth, t, v);
                     row[0] = kind; // of the side, or none
                     row[0] += f < 0 ? POINT : f == 0 ? LINE_Y : LINE_X, row[1] = i, row[2] = j;
                     row[3] = outside ? 1 : -1;
@@ -508,46 +560,7 @@ struct grid_search
         }
     }
 
-    // The nearest point of a cell to a sphere's centre: the way from there to the centre, and whether that is above.
-    struct Foot
-    {
-        REAL away[3], square;
-        bool outside;
-
-        CUDA_CALLABLE inline Foot(const REAL* h, const REAL* cell, REAL x, REAL y, REAL z, int steps)
-        {
-            const REAL per_x = 1 / cell[0], per_y = 1 / cell[1];
-            const REAL run = (h[2] - h[0]) * per_x, rise = (h[1] - h[0]) * per_y;
-            const REAL twist = (h[0] - h[2] - h[1] + h[3]) * (per_x * per_y), above = z - h[0];
-            REAL s = inside(x, cell[0]), t = inside(y, cell[1]);
-            LOOP
-            for (int step = 0; step < steps; ++step) {
-                const REAL a = run + twist * t, b = rise + twist * s, w = above - run * s - b * t;
-                const REAL right_x = (x - s) + a * w, right_y = (y - t) + b * w;
-                const REAL along_x = a * a + 1, along_y = b * b + 1, both = a * b, inverse = 1 / (along_x + b * b);
-                if (step % 2 == 0) {
-                    const REAL next = inside(s + (along_y * right_x - both * right_y) * inverse, cell[0]);
-                    t = inside(t + (right_y - both * (next - s)) / along_y, cell[1]);
-                    s = next;
-                } else {
-                    const REAL next = inside(t + (along_x * right_y - both * right_x) * inverse, cell[1]);
-                    s = inside(s + (right_x - both * (next - t)) / along_x, cell[0]);
-                    t = next;
-                }
-            }
-            const REAL a = run + twist * t, b = rise + twist * s;
-            away[0] = x - s, away[1] = y - t, away[2] = above - run * s - b * t;
-            square = along(*this);
-            outside = away[2] - a * away[0] - b * away[1] > 0;
-        }
-
-        static CUDA_CALLABLE inline REAL inside(REAL x, REAL size) { return x > 0 ? (x < size ? x : size) : 0; }
-
-        CUDA_CALLABLE inline REAL along(const Foot& other) const
-        {
-            return away[0] * other.away[0] + away[1] * other.away[1] + away[2] * other.away[2];
-        }
-    };
+FEET_OF_CELLS
 
     // The corners of a cell, which beyond an edge is level across it; ``last``: the numbers of the field's last cell.
     static CUDA_CALLABLE inline void levelled(const REAL* cells, const int* each, const int* last, REAL* h)
@@ -563,12 +576,13 @@ struct grid_search
     }
 
     // Asked are the first height, the centre from there, the cell, points along x and y, how many cells to each side
-    // are tried, and whether for a second one; found are the nearest cell, the second, and whether that is there.
+    // are tried, whether for a second one, and how far below the centre the field matters; found are the nearest cell,
+    // the second, and whether that is there. Where no cell matters it is one of them.
     static CUDA_CALLABLE inline void sphere(const REAL* table, const REAL* asked, REAL* out)
     {
-        const REAL *cells = table + 4ll * (int)asked[0], *size = asked + 4;
-        const int ring = (int)asked[8];
-        REAL at[2], corners[4];
+        const REAL *cells = table + 4ll * (int)asked[0], *size = asked + 4, bottom = asked[3] - asked[10];
+        const int ring = (int)asked[8], count = 4 * ring * ring;
+        REAL at[2];
         int middle[2], last[2];
         for (int f = 0; f < 2; ++f) {
             last[f] = (int)asked[6 + f] - 2;
@@ -576,34 +590,52 @@ struct grid_search
             at[f] = x > -ring ? (x < most ? x : most) : -ring;
             middle[f] = (int)(at[f] + ring + (REAL)0.5) - ring;
         }
-        REAL away[CELLS][3], squares[CELLS]; // of each cell's nearest point; a square that is negative: inside
+        REAL away[CELLS][3], squares[CELLS], x[BATCH], y[BATCH], corners[BATCH][4]; // a square below 0: inside
         int nearest = 0;
         LOOP
-        for (int n = 0; n < 4 * ring * ring; ++n) {
-            const int each[2] = {middle[0] - ring + n / (2 * ring), middle[1] - ring + n % (2 * ring)};
-            levelled(cells, each, last, corners);
-            const Foot foot(corners, size, (at[0] - each[0]) * size[0], (at[1] - each[1]) * size[1], asked[3], STEPS);
-            for (int x = 0; x < 3; ++x) away[n][x] = foot.away[x];
-            squares[n] = foot.outside ? foot.square : -foot.square;
-            if (!n || foot.square < NEARER * on::absolute(squares[nearest])) nearest = n;
+        for (int begin = 0; begin < count; begin += BATCH) {
+            bool low = true;
+            ALL
+            for (int n = 0; n < BATCH; ++n) {
+                const int each[2]
+                    = {middle[0] - ring + (begin + n) / (2 * ring), middle[1] - ring + (begin + n) % (2 * ring)};
+                levelled(cells, each, last, corners[n]);
+                x[n] = (at[0] - each[0]) * size[0], y[n] = (at[1] - each[1]) * size[1];
+                for (int k = 0; k < 4; ++k) low &= corners[n][k] < bottom;
+            }
+            if (low) {
+                for (int n = 0; n < BATCH; ++n) squares[begin + n] = FAR;
+                continue;
+            }
+            const FeetOfBatch feet(corners, size, x, y, asked[3], STEPS);
+            ALL
+            for (int n = 0; n < BATCH; ++n) {
+                for (int k = 0; k < 3; ++k) away[begin + n][k] = feet.away[n][k];
+                squares[begin + n] = feet.outside[n] ? feet.square[n] : -feet.square[n];
+            }
+        }
+        REAL least = FAR;
+        LOOP
+        for (int n = 0; n < count; ++n) {
+            const REAL square = on::absolute(squares[n]);
+            if (square < NEARER * least) nearest = n, least = square;
         }
         const int best[2] = {middle[0] - ring + nearest / (2 * ring), middle[1] - ring + nearest % (2 * ring)};
-        out[0] = best[0], out[1] = best[1], out[2] = out[3] = 0;
-        levelled(cells, best, last, corners);
-        const Foot first(
-            corners, size, (at[0] - best[0]) * size[0], (at[1] - best[1]) * size[1], asked[3], STEPS + 1);
-        out[4] = first.outside;
+        out[0] = best[0], out[1] = best[1], out[2] = out[3] = out[4] = 0;
         if (!(int)asked[9]) return;
-        REAL least = FAR; // the second looks away from what the first found
+        levelled(cells, best, last, corners[0]);
+        x[0] = (at[0] - best[0]) * size[0], y[0] = (at[1] - best[1]) * size[1];
+        const FeetOfOne first(corners, size, x, y, asked[3], STEPS + 1);
+        least = FAR; // the second looks away from what the first found
         LOOP
-        for (int n = 0; n < 4 * ring * ring; ++n) {
+        for (int n = 0; n < count; ++n) {
             const REAL square = squares[n], *w = away[n];
-            const REAL turned = w[0] * first.away[0] + w[1] * first.away[1] + w[2] * first.away[2];
-            const bool aside = turned < 0 || turned * turned < APART * square * first.square;
-            if (!(square > 0) || !aside || !(square < NEARER * least)) continue;
+            if (!(square > 0 && square < NEARER * least)) continue;
+            const REAL turned = w[0] * first.away[0][0] + w[1] * first.away[0][1] + w[2] * first.away[0][2];
+            if (!(turned < 0 || turned * turned < APART * square * first.square[0])) continue;
             least = square, out[2] = middle[0] - ring + n / (2 * ring), out[3] = middle[1] - ring + n % (2 * ring);
         }
-        if (!(least < FAR)) out[4] = 0;
+        out[4] = first.outside[0] && least < FAR;
     }
 
     // The hull's own ``count`` numbers are its corners; place and presence of those that touch, see hull_corners.

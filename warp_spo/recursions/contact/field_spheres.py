@@ -63,17 +63,19 @@ def sphere_surfaces(
     radius: Value,
     cells: int,
     second: bool,
+    below: Value,
 ) -> list[Surface]:
     """Return the surfaces that a sphere may touch, ``centre`` in inertial axes [m].
 
-    ``cells``: see :func:`ring`. ``second``: whether there may be two.
+    ``cells``: see :func:`ring`. ``second``: whether there may be two. ``below``: how far below the centre [m] the field
+    matters; what is lower may be taken for farther than it is.
     """
     (size_x, size_y), (rows, columns) = ground.cells, ground.heights.shape[-2:]
     x, y, z = (at - a - b for at, a, b in zip(centre, place.origin, ground.origin, strict=True))
     first: Value = 0.0
     if ground.count > 1:
         first = floor(clamp(place.field, ground.count - 1.0)) * float(rows * columns)
-    asked = [first, x, y, z, size_x, size_y, float(rows), float(columns), float(cells), float(second)]
+    asked = [first, x, y, z, size_x, size_y, float(rows), float(columns), float(cells), float(second), below]
     *found, there = search(graph, GROUND, SPHERE, asked, FOUND)
     at_x = clamp(x * (1.0 / size_x), rows - 1.0 + cells, -float(cells))
     at_y = clamp(y * (1.0 / size_y), columns - 1.0 + cells, -float(cells))

@@ -57,6 +57,7 @@ if TYPE_CHECKING:
 ARMS = 8  # spheres of a segment up to which their arms are kept, see docs/contact_measured.md
 STANDING = (0.0, 0.0, 1.0)  # normal of the ground in a body's frame for which weights of points that move are taken
 FASTER, REACHES = 5.0, 2.0  # speed that a step may add to a shape's [m/s]; way per speed and step that is looked down
+FAR = 1e30  # way down [m] that no field is below
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
 
 
@@ -200,7 +201,8 @@ def place_points(
             assert isinstance(ground, HeightField) and point.support is not None
             if point.contact not in searches:
                 at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
-                below = None if gaps else joint_laws.h * _speed_bound(trace, number, mine.travel, centre)
+                size = total(_support_values(trace, number)[1])
+                below = size if gaps else joint_laws.h * _speed_bound(mine.travel, centre, size)
                 shape = _shape_over(trace, number, ground, place_of_ground, at, toward, radius, below)
                 searches[point.contact] = shape, find(trace.graph, ground, place_of_ground, shape)
             shape, rows = searches[point.contact]
@@ -253,8 +255,10 @@ def place_points(
             touched = [grid.surface]
         elif rolls and isinstance(ground, HeightField):
             second = surface_count(ground, place_of_ground.varies, point.walls, rolls) == 2
-            cells = ring(ground, point.radius)
-            touched = sphere_surfaces(trace.graph, ground, at, place_of_ground, radius, cells, second)
+            cells, below = ring(ground, point.radius), FAR
+            if not gaps:
+                below = radius + joint_laws.h * _speed_bound(mine.travel, centre, radius)
+            touched = sphere_surfaces(trace.graph, ground, at, place_of_ground, radius, cells, second, below)
         else:
             touched = surfaces(trace.graph, ground, at, place_of_ground, moves, point.walls)
         for normal, depth, cell, near in touched:
@@ -345,27 +349,27 @@ def _shape_over(
     middle: list[Value],
     toward: list[Vector],
     radius: Value,
-    below: Value | None = None,
+    below: Value = 0.0,
 ) -> Shape:
     """Return the shape of a point over a field; ``middle``: of the shape, ``toward``: the inertial axes in its link.
 
-    ``below``: by how much the field may be below it; None: by its size.
+    ``below``: by how much the field may be below it [m].
     """
     support = trace.links.scene.contact_points[number].support
     assert support is not None
     axes, sizes, _ = _support_values(trace, number)
     centre = Vector(x - place.origin[c] - ground.origin[c] for c, x in enumerate(middle))
     turned = [Vector(dot(way, axis) for way in toward) for axis in axes]
-    return Shape(support.kind, centre, turned, sizes, radius, total(sizes) if below is None else below, support.table)
+    return Shape(support.kind, centre, turned, sizes, radius, below, support.table)
 
 
-def _speed_bound(trace: Trace, number: int, twist: Twist, middle: Vector) -> Value:
+def _speed_bound(twist: Twist, middle: Vector, size: Value) -> Value:
     """Return a bound of how fast a shape and the ground may come closer in the step, times REACHES.
 
-    ``twist``: of its link. ``middle``: of the shape in the link.
+    ``twist``: of its link. ``middle``: of the shape in the link. ``size``: how far the shape reaches from there [m].
     """
-    (w, v), (_, sizes, _) = twist, _support_values(trace, number)
-    speed = total(absolute(x) for x in v + cross(w, middle)) + total(absolute(x) for x in w) * total(sizes)
+    w, v = twist
+    speed = total(absolute(x) for x in v + cross(w, middle)) + total(absolute(x) for x in w) * size
     return REACHES * speed + FASTER
 
 
