@@ -65,14 +65,14 @@ FEET = r"""\
 
         // ``h``: their corners. ``x``, ``y``: of the centre from the first one.
         CUDA_CALLABLE inline FeetNAME(
-            const REAL (*h)[4], const REAL* cell, const REAL* x, const REAL* y, REAL z, int steps)
+            const REAL* h, const REAL* cell, const REAL* x, const REAL* y, REAL z, int steps)
         {
             const REAL per_x = 1 / cell[0], per_y = 1 / cell[1];
             REAL run[COUNT], rise[COUNT], twist[COUNT], above[COUNT], s[COUNT], t[COUNT];
             ALL
             for (int n = 0; n < COUNT; ++n) {
-                run[n] = (h[n][2] - h[n][0]) * per_x, rise[n] = (h[n][1] - h[n][0]) * per_y;
-                twist[n] = (h[n][0] - h[n][2] - h[n][1] + h[n][3]) * (per_x * per_y), above[n] = z - h[n][0];
+                run[n] = (h[4 * n + 2] - h[4 * n]) * per_x, rise[n] = (h[4 * n + 1] - h[4 * n]) * per_y;
+                twist[n] = (h[4 * n] - h[4 * n + 2] - h[4 * n + 1] + h[4 * n + 3]) * (per_x * per_y), above[n] = z - h[4 * n];
                 s[n] = inside(x[n], cell[0]), t[n] = inside(y[n], cell[1]);
             }
             LOOP
@@ -590,7 +590,7 @@ FEET_OF_CELLS
             at[f] = x > -ring ? (x < most ? x : most) : -ring;
             middle[f] = (int)(at[f] + ring + (REAL)0.5) - ring;
         }
-        REAL away[CELLS][3], squares[CELLS], x[BATCH], y[BATCH], corners[BATCH][4]; // a square below 0: inside
+        REAL away[CELLS][3], squares[CELLS], x[BATCH], y[BATCH], corners[4 * BATCH]; // a square below 0: inside
         int nearest = 0;
         LOOP
         for (int begin = 0; begin < count; begin += BATCH) {
@@ -599,9 +599,9 @@ FEET_OF_CELLS
             for (int n = 0; n < BATCH; ++n) {
                 const int each[2]
                     = {middle[0] - ring + (begin + n) / (2 * ring), middle[1] - ring + (begin + n) % (2 * ring)};
-                levelled(cells, each, last, corners[n]);
+                levelled(cells, each, last, corners + 4 * n);
                 x[n] = (at[0] - each[0]) * size[0], y[n] = (at[1] - each[1]) * size[1];
-                for (int k = 0; k < 4; ++k) low &= corners[n][k] < bottom;
+                for (int k = 0; k < 4; ++k) low &= corners[4 * n + k] < bottom;
             }
             if (low) {
                 for (int n = 0; n < BATCH; ++n) squares[begin + n] = FAR;
@@ -623,7 +623,7 @@ FEET_OF_CELLS
         const int best[2] = {middle[0] - ring + nearest / (2 * ring), middle[1] - ring + nearest % (2 * ring)};
         out[0] = best[0], out[1] = best[1], out[2] = out[3] = out[4] = 0;
         if (!(int)asked[9]) return;
-        levelled(cells, best, last, corners[0]);
+        levelled(cells, best, last, corners);
         x[0] = (at[0] - best[0]) * size[0], y[0] = (at[1] - best[1]) * size[1];
         const FeetOfOne first(corners, size, x, y, asked[3], STEPS + 1);
         least = FAR; // the second looks away from what the first found
