@@ -72,7 +72,8 @@ FEET = r"""\
             ALL
             for (int n = 0; n < COUNT; ++n) {
                 run[n] = (h[4 * n + 2] - h[4 * n]) * per_x, rise[n] = (h[4 * n + 1] - h[4 * n]) * per_y;
-                twist[n] = (h[4 * n] - h[4 * n + 2] - h[4 * n + 1] + h[4 * n + 3]) * (per_x * per_y), above[n] = z - h[4 * n];
+                twist[n] = (h[4 * n] - h[4 * n + 2] - h[4 * n + 1] + h[4 * n + 3]) * (per_x * per_y);
+                above[n] = z - h[4 * n];
                 s[n] = inside(x[n], cell[0]), t[n] = inside(y[n], cell[1]);
             }
             LOOP
@@ -114,7 +115,7 @@ struct grid_search
     {
         const REAL* cells;
         const REAL *centre, *axes, *sizes;
-        REAL cell[2], reach[3], bottom; // what is below the bottom is not looked at
+        REAL cell[2], reach[3], below, bottom; // what is below the bottom is not looked at
         int count[2], low[2], high[2];
 
         CUDA_CALLABLE inline Field(const REAL* table, const REAL* asked)
@@ -131,7 +132,7 @@ struct grid_search
                 reach[f] = 0;
                 for (int k = 0; k < 3; ++k) reach[f] += on::absolute(axes[3 * k + f]) * half[k];
             }
-            bottom = centre[2] - reach[2] - asked[20];
+            below = asked[20], bottom = centre[2] - reach[2] - below;
         }
 
         CUDA_CALLABLE inline REAL height(int i, int j) const { return cells[4ll * (i * count[1] + j)]; }
@@ -511,6 +512,8 @@ struct grid_search
     {
         const REAL *c = field.centre, *axis = field.axes + 6;
         const REAL radius = field.sizes[0], half = field.sizes[2];
+        const REAL cell = field.cell[0] > field.cell[1] ? field.cell[0] : field.cell[1];
+        const REAL band = (radius + field.below + cell) * on::sqrt(axis[0] * axis[0] + axis[1] * axis[1]);
         int low[2], high[2];
         for (int f = 0; f < 2; ++f) {
             const REAL reach = on::absolute(axis[f]) * half + radius;
@@ -522,6 +525,7 @@ struct grid_search
             for (int j = low[1]; j <= high[1]; ++j) {
                 if (field.is_low(i, j)) continue;
                 const REAL w[3] = {c[0] - i * field.cell[0], c[1] - j * field.cell[1], c[2] - field.height(i, j)};
+                if (on::absolute(w[0] * axis[1] - w[1] * axis[0]) > band) continue;
                 const REAL along = field.along(2, w[0], w[1], w[2]);
                 ALL
                 for (int f = -1; f < 2; ++f) { // the grid point, its line along y, its line along x
@@ -547,17 +551,29 @@ struct grid_search
                     const REAL distance = on::sqrt(squares), depth = kind ? radius - distance : -distance;
                     const REAL v = kind ? -(sideways[0] * away[0] + sideways[1] * away[1]) : (REAL)0;
                     if (!(meets && on::absolute(t) < half && best.is_better(depth, t, v))) continue;
-                    const bool outside = surface(field, c[0] + t * axis[0], c[1] + t * axis[1]) <= c[2] + t * axis[2];
-                    const bool side = away[2] >= DOWN * distance
-                        && radius - distance <= half - on::absolute(t) + slack;
-                    if (outside && !(kind ? side : away[2] > 0)) continue;
+                    const bool below = kind
+                        ? away[2] >= DOWN * distance && radius - distance <= half - on::absolute(t) + slack
+                        : away[2] > 0;
+                    if (!below && is_outside(field, t)) continue;
                     REAL* row = best.take(depth, t, v);
                     row[0] = kind; // of the side, or none
-                    row[0] += f < 0 ? POINT : f == 0 ? LINE_Y : LINE_X, row[1] = i, row[2] = j;
-                    row[3] = outside ? 1 : -1;
+                    row[0] += f < 0 ? POINT : f == 0 ? LINE_Y : LINE_X, row[1] = i, row[2] = j, row[4] = t;
                 }
             }
         }
+        LOOP
+        for (int q = 0; q < QUADRANTS; ++q) {
+            REAL* row = best.rows + ROW * q;
+            if (row[0]) row[3] = is_outside(field, row[4]) ? 1 : -1;
+            row[4] = 0;
+        }
+    }
+
+    // Whether the axis of a capsule or a cylinder is above the field, at ``t`` from its middle.
+    static CUDA_CALLABLE inline bool is_outside(const Field& field, REAL t)
+    {
+        const REAL *c = field.centre, *axis = field.axes + 6;
+        return surface(field, c[0] + t * axis[0], c[1] + t * axis[1]) <= c[2] + t * axis[2];
     }
 
 FEET_OF_CELLS
