@@ -1,0 +1,171 @@
+"""Spheres over the cells of a height field, corners of hulls over it, and its height at a place."""
+
+TEXT = r"""
+    // The nearest point of a cell to a sphere's centre: the way from there to the centre, and whether that is above.
+    struct Foot
+    {
+        REAL away[3], square;
+        bool outside;
+
+        CUDA_CALLABLE inline Foot(const REAL* h, const REAL* cell, REAL x, REAL y, REAL z, int steps)
+        {
+            const REAL per_x = 1 / cell[0], per_y = 1 / cell[1];
+            const REAL run = (h[2] - h[0]) * per_x, rise = (h[1] - h[0]) * per_y;
+            const REAL twist = (h[0] - h[2] - h[1] + h[3]) * (per_x * per_y), above = z - h[0];
+            REAL s = inside(x, cell[0]), t = inside(y, cell[1]);
+            LOOP
+            for (int step = 0; step < steps; ++step) {
+                const REAL a = run + twist * t, b = rise + twist * s, w = above - run * s - b * t;
+                const REAL right_x = (x - s) + a * w, right_y = (y - t) + b * w;
+                const REAL along_x = a * a + 1, along_y = b * b + 1, both = a * b, inverse = 1 / (along_x + b * b);
+                if (step % 2 == 0) {
+                    const REAL next = inside(s + (along_y * right_x - both * right_y) * inverse, cell[0]);
+                    t = inside(t + (right_y - both * (next - s)) / along_y, cell[1]);
+                    s = next;
+                } else {
+                    const REAL next = inside(t + (along_x * right_y - both * right_x) * inverse, cell[1]);
+                    s = inside(s + (right_x - both * (next - t)) / along_x, cell[0]);
+                    t = next;
+                }
+            }
+            const REAL a = run + twist * t, b = rise + twist * s;
+            away[0] = x - s, away[1] = y - t, away[2] = above - run * s - b * t;
+            square = along(*this);
+            outside = away[2] - a * away[0] - b * away[1] > 0;
+        }
+
+        static CUDA_CALLABLE inline REAL inside(REAL x, REAL size) { return x > 0 ? (x < size ? x : size) : 0; }
+
+        CUDA_CALLABLE inline REAL along(const Foot& other) const
+        {
+            return away[0] * other.away[0] + away[1] * other.away[1] + away[2] * other.away[2];
+        }
+    };
+
+    // The corners of a cell, which beyond an edge is level across it; ``last``: the numbers of the field's last cell.
+    static CUDA_CALLABLE inline void levelled(const REAL* cells, const int* each, const int* last, REAL* h)
+    {
+        int in[2];
+        for (int f = 0; f < 2; ++f) in[f] = each[f] > 0 ? (each[f] < last[f] ? each[f] : last[f]) : 0;
+        const REAL* at = cells + 4ll * (in[0] * (last[1] + 2) + in[1]);
+        for (int n = 0; n < 4; ++n) {
+            const int i = each[0] == in[0] ? n / 2 : each[0] > in[0];
+            const int j = each[1] == in[1] ? n % 2 : each[1] > in[1];
+            h[n] = at[2 * i + j];
+        }
+    }
+
+    // Asked are the first height, the centre from there, the cell, points along x and y, how many cells to each side
+    // are tried, and whether for a second one; found are the nearest cell, the second, and whether that is there.
+    static CUDA_CALLABLE inline void sphere(const REAL* table, const REAL* asked, REAL* out)
+    {
+        const REAL *cells = table + 4ll * (int)asked[0], *size = asked + 4;
+        const int ring = (int)asked[8];
+        REAL at[2], corners[4];
+        int middle[2], last[2];
+        for (int f = 0; f < 2; ++f) {
+            last[f] = (int)asked[6 + f] - 2;
+            const REAL x = asked[1 + f] * (1 / size[f]), most = asked[6 + f] - 1 + ring;
+            at[f] = x > -ring ? (x < most ? x : most) : -ring;
+            middle[f] = (int)(at[f] + ring + (REAL)0.5) - ring;
+        }
+        REAL first[3] = {0, 0, 0}, square = 0;
+        out[2] = out[3] = 0;
+        LOOP
+        for (int round = 0; round < 1 + (int)asked[9]; ++round) { // the second looks away from what the first found
+            REAL least = FAR;
+            int best[2] = {0, 0};
+            LOOP
+            for (int n = 0; n < 4 * ring * ring; ++n) {
+                const int each[2] = {middle[0] - ring + n / (2 * ring), middle[1] - ring + n % (2 * ring)};
+                levelled(cells, each, last, corners);
+                const Foot foot(
+                    corners, size, (at[0] - each[0]) * size[0], (at[1] - each[1]) * size[1], asked[3], STEPS);
+                if (round) {
+                    const REAL turned = foot.away[0] * first[0] + foot.away[1] * first[1] + foot.away[2] * first[2];
+                    if (!foot.outside || !(turned < 0 || turned * turned < APART * foot.square * square)) continue;
+                }
+                if (foot.square < NEARER * least) least = foot.square, best[0] = each[0], best[1] = each[1];
+            }
+            out[2 * round] = best[0], out[2 * round + 1] = best[1];
+            if (round) {
+                if (!(least < FAR)) out[4] = 0;
+                continue;
+            }
+            levelled(cells, best, last, corners);
+            const Foot foot(
+                corners, size, (at[0] - best[0]) * size[0], (at[1] - best[1]) * size[1], asked[3], STEPS + 1);
+            for (int x = 0; x < 3; ++x) first[x] = foot.away[x];
+            square = foot.square, out[4] = foot.outside;
+        }
+    }
+
+    // The hull's own ``count`` numbers are its corners; place and presence of those that touch, see hull_corners.
+    static CUDA_CALLABLE inline void corners(
+        const REAL* table, const REAL* asked, const REAL* of, int count, REAL* out)
+    {
+        const Field field(table, asked);
+        REAL reach[CHOSEN], lean[CHOSEN][2];
+        int best[CHOSEN];
+        for (int row = 0; row < CHOSEN; ++row) {
+            on::sincos(2 * PI / (CHOSEN - 1) * row, lean[row][1], lean[row][0]);
+            for (int f = 0; f < 2; ++f) lean[row][f] *= row ? LEAN : 0;
+            best[row] = 0, reach[row] = -FAR;
+        }
+        LOOP
+        for (int i = 0; i < count / 3; ++i) {
+            REAL w[3];
+            for (int x = 0; x < 3; ++x) {
+                w[x] = 0;
+                for (int k = 0; k < 3; ++k) w[x] += of[3 * i + k] * field.axes[3 * k + x];
+            }
+            const REAL ground = floor(field, field.centre[0] + w[0], field.centre[1] + w[1]);
+            const REAL depth = ground - (field.centre[2] + w[2]);
+            for (int row = 0; row < CHOSEN; ++row) {
+                const REAL far = depth + (lean[row][0] * w[0] + lean[row][1] * w[1]);
+                if (far > reach[row] + TIE) best[row] = i, reach[row] = far;
+            }
+        }
+        for (int row = 0; row < CHOSEN; ++row) {
+            for (int c = 0; c < 3; ++c) out[4 * row + c] = of[3 * best[row] + c];
+            out[4 * row + 3] = 1;
+            for (int before = 0; before < row; ++before)
+                if (best[before] == best[row]) out[4 * row + 3] = 0;
+        }
+    }
+
+    // The height of the field at a place, also beyond its edges; where its cell is steep that of the lowest corner.
+    static CUDA_CALLABLE inline REAL floor(const Field& field, REAL x, REAL y)
+    {
+        const REAL place[2] = {x / field.cell[0], y / field.cell[1]};
+        REAL part[2], h[4];
+        int each[2], last[2];
+        for (int f = 0; f < 2; ++f) {
+            part[f] = field.limited(place[f], f), last[f] = field.count[f] - 2;
+            each[f] = (int)part[f] < last[f] ? (int)part[f] : last[f];
+            part[f] -= each[f];
+            if (place[f] < 0) each[f] = -1;
+            if (place[f] > field.count[f] - 1) each[f] = last[f] + 1;
+        }
+        levelled(field.cells, each, last, h);
+        const REAL slope_x = (h[2] + h[3] - h[0] - h[1]) / (2 * field.cell[0]);
+        const REAL slope_y = (h[1] + h[3] - h[0] - h[2]) / (2 * field.cell[1]);
+        if (slope_x * slope_x + slope_y * slope_y > 1) return least(least(h[0], h[1]), least(h[2], h[3]));
+        const REAL low = h[0] + part[1] * (h[1] - h[0]), high = h[2] + part[1] * (h[3] - h[2]);
+        return low + part[0] * (high - low);
+    }
+
+    // The height of the field at a place.
+    static CUDA_CALLABLE inline REAL surface(const Field& field, REAL x, REAL y)
+    {
+        REAL part[2] = {field.limited(x / field.cell[0], 0), field.limited(y / field.cell[1], 1)};
+        int at[2];
+        for (int f = 0; f < 2; ++f) {
+            at[f] = (int)part[f] < field.count[f] - 2 ? (int)part[f] : field.count[f] - 2;
+            part[f] -= at[f];
+        }
+        const REAL* h = field.cells + 4ll * (at[0] * field.count[1] + at[1]);
+        const REAL low = h[0] + part[1] * (h[1] - h[0]), high = h[2] + part[1] * (h[3] - h[2]);
+        return low + part[0] * (high - low);
+    }
+"""
