@@ -16,12 +16,13 @@ from .elementary import C_TYPE
 NAME = "grid_search"
 RULES = {
     "OUTWARD": 1e-3, "TIE": 1e-6, "DOWN": 0.5, "ACROSS": 0.17, "BESIDE": 0.35, "SLACK": 0.5, "PARALLEL": 1e-6,
-    "FAR": 1e30, "APART": 0.94 * 0.94, "ABOVE": 0.5, "STANDS": 0.7, "PI": math.pi, "LOW": 0.1, "STEEPEST": 0.1,
-    "LEAN": math.tan(hull_corners.LEAN), "NEARER": 1.0 - 1e-6, "FLAT": 1e-4, "BENT": 4e-4, "NEAR": 1e-3,
+    "FAR": 1e30, "APART": 0.94 * 0.94, "ABOVE": 0.5, "STANDS": 0.7, "PI": math.pi, "LOW": 0.1, "STEEPEST": 0.1, "LEANS": 0.95,
+   
+    "LEAN": math.tan(hull_corners.LEAN), "NEARER": 1.0 - 1e-6, "FLAT": 1e-4, "BENT": 4e-4, "NEAR": 1e-3, "BEYOND": 0.01,
 }  # fmt: skip
 KINDS = {
-    "QUADRANTS": 4, "ROW": 9, "POINT": 1, "INSIDE": 2, "LINE_Y": 3, "LINE_X": 4, "SIDE": 4, "RIMS": 9, "EDGES": 32,
-    "STEPS": 2, "TURNS": 4, "NEARINGS": 6, "CHOSEN": hull_corners.ROWS,
+    "QUADRANTS": 4, "ROW": 9, "POINT": 1, "INSIDE": 2, "VERTEX": 3, "LINE_Y": 4, "LINE_X": 5, "SIDE": 5, "RIMS": 11,
+    "EDGES": 32, "STEPS": 2, "TURNS": 4, "NEARINGS": 6, "CHOSEN": hull_corners.ROWS,
 }  # fmt: skip
 
 
@@ -171,7 +172,10 @@ GRID = r"""
         // How far in the cell a place is, along x (f = 0) or y, in cells.
         CUDA_CALLABLE inline REAL part(REAL x, int f) const { return x / cell[f] - (f == 0 ? i : j); }
 
-        static CUDA_CALLABLE inline bool holds(REAL s, REAL t) { return s >= 0 && s <= 1 && t >= 0 && t <= 1; }
+        static CUDA_CALLABLE inline bool holds(REAL s, REAL t, REAL more = 0)
+        {
+            return s >= -more && s <= 1 + more && t >= -more && t <= 1 + more;
+        }
     };
 
     // The cells that a straight line passes, seen from above: row after row along x, in each along y.

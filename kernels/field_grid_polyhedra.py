@@ -32,11 +32,11 @@ TEXT = r"""
         Field field;
         Best best;
         REAL slack;
-        int u, v;
+        int u, v, lower;
         const REAL* sideways; // of a cylinder that lies: the horizontal direction across its axis, x and y
 
         CUDA_CALLABLE inline Polyhedron(const REAL* table, const REAL* asked, REAL* out)
-            : field(table, asked), best(out), sideways(nullptr)
+            : field(table, asked), best(out), lower(-1), sideways(nullptr)
         {
             const REAL *c = field.centre, *A = field.axes, *half = field.sizes;
             slack = SLACK * least(least(half[0], half[1]), half[2]);
@@ -69,8 +69,9 @@ TEXT = r"""
             for (int k = 0; k < 3; ++k) row[3 + k] = out[k], row[6 + k] = offset * out[k];
         }
 
-        // An edge about ``seat`` along ``local``; ``bends``: it is straight, and may touch the inside of a cell.
-        CUDA_CALLABLE inline void cross(const Edge& edge, const REAL* seat, const REAL* local, REAL half, bool bends)
+        // An edge about ``seat`` along ``local``; ``round``: the inverse of the radius of the
+        // rim of which it is an edge, or 0 if it is straight and may touch the inside of a cell.
+        CUDA_CALLABLE inline void cross(const Edge& edge, const REAL* seat, const REAL* local, REAL half, REAL round)
         {
             if (!(edge.lowest <= -LOW)) return;
             LOOP
@@ -97,12 +98,42 @@ TEXT = r"""
                     const REAL depth = (field.height(i, j) + (place - m) * rises - at[2] - t * along[2]) * up;
                     if (!edge.carries(x, y, up) || depth > half - on::absolute(t) + slack) continue;
                     const bool gentle = edge.lowest <= -DOWN && on::absolute(rise) <= 1 && up >= DOWN;
-                    if (!gentle && !(up >= STEEPEST && field.slope_beside(line, m, place - m, f, -1) >= slope
-                                     && field.slope_beside(line, m, place - m, f, 0) <= slope)) continue;
+                    if (!gentle) { // only on a crease, where the field falls away on both sides
+                        const REAL turn = t * round, on_f = across - turn * (f == 0 ? edge.one[0] : edge.one[1]);
+                        const REAL on_o = aside - turn * (f == 0 ? edge.one[1] : edge.one[0]);
+                        const REAL falls = (along[2] - turn * edge.one[2] - on_o * rise) / on_f;
+                        if (!(up >= STEEPEST && field.slope_beside(line, m, place - m, f, -1) >= falls
+                              && field.slope_beside(line, m, place - m, f, 0) <= falls)) continue;
+                    }
                     take_edge(edge, seat, local, t, depth, f == 0 ? LINE_Y : LINE_X, i, j);
                 }
             }
-            if (bends) cross_cells(edge, seat, local, half);
+            if (round > 0) return;
+            cross_cells(edge, seat, local, half);
+            for (int end = -1; end < 2; end += 2) take_vertex(edge, seat, local, end * half);
+        }
+
+        // The end of an edge, at t, in a wall; ``lower``: the axis of a box whose lower corners are points of its own.
+        CUDA_CALLABLE inline void take_vertex(const Edge& edge, const REAL* seat, const REAL* local, REAL t)
+        {
+            const REAL* A = field.axes;
+            if (lower >= 0 && (seat[lower] + t * local[lower]) * A[3 * lower + 2] < 0) return;
+            REAL at[3], part[2];
+            int each[2];
+            for (int x = 0; x < 3; ++x) at[x] = edge.at[x] + t * edge.along[x];
+            for (int f = 0; f < 2; ++f) {
+                part[f] = at[f] / field.cell[f];
+                if (!(part[f] >= 0 && part[f] <= field.count[f] - 1)) return;
+                each[f] = (int)part[f] < field.count[f] - 2 ? (int)part[f] : field.count[f] - 2;
+                part[f] -= each[f];
+            }
+            const Patch patch(field, each[0], each[1]);
+            const REAL a = patch.slope_x(part[1]), b = patch.slope_y(part[0]);
+            const REAL up = on::inverse_root(1 + a * a + b * b);
+            if (!(a * a + b * b > 1 && up >= STEEPEST && edge.carries(-a * up, -b * up, up))) return;
+            const REAL zero[3] = {0, 0, 0}, place[3] = {
+                seat[0] + t * local[0], seat[1] + t * local[1], seat[2] + t * local[2]};
+            take_edge(edge, place, zero, 0, (patch.height(part[0], part[1]) - at[2]) * up, VERTEX, each[0], each[1]);
         }
 
         // Where an edge is farthest below the inside of a bent cell.
@@ -145,6 +176,7 @@ TEXT = r"""
         if (shape.field.is_far()) return;
         const Field& field = shape.field;
         const REAL *A = field.axes, *half = field.sizes;
+        shape.lower = 3 - shape.u - shape.v;
         LOOP
         for (int i = field.low[0]; i <= field.high[0]; ++i) {
             LOOP
@@ -176,7 +208,7 @@ TEXT = r"""
                 one[x] = x == first ? a : 0, other[x] = x == second ? b : 0, local[x] = x == k;
                 seat[x] = half[x] * (one[x] + other[x]);
             }
-            shape.cross(Edge(field, seat, local, one, other), seat, local, half[k], true);
+            shape.cross(Edge(field, seat, local, one, other), seat, local, half[k], 0);
         }
     }
 
@@ -218,7 +250,7 @@ TEXT = r"""
         LOOP
         for (int edge = 0; edge < edges; ++edge) {
             const REAL* each = of + 1 + 4 * faces + 13 * edge;
-            shape.cross(Edge(field, each, each + 3, each + 7, each + 10), each, each + 3, each[6], true);
+            shape.cross(Edge(field, each, each + 3, each + 7, each + 10), each, each + 3, each[6], 0);
         }
     }
 """

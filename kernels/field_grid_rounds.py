@@ -29,6 +29,9 @@ TEXT = r"""
             }
         }
         rim(shape, radius, half, end);
+        if (on::absolute(lean) > LEANS) return;
+        rim(shape, radius, half, -end);
+        beside_axis(field, shape.best, shape.slack, SIDE, nullptr);
     }
 
     // The rim of a cylinder at the end -1 or 1 of its axis, as so many edges.
@@ -43,7 +46,7 @@ TEXT = r"""
             const REAL out[3] = {turn[0], turn[1], 0}, local[3] = {-turn[1], turn[0], 0};
             const REAL far = radius * share[0], seat[3] = {far * out[0], far * out[1], half * face[2]};
             const Edge edge(shape.field, seat, local, out, face);
-            shape.cross(edge, seat, local, radius * share[1], false);
+            shape.cross(edge, seat, local, radius * share[1], 1 / radius);
             if (edge.lowest <= -LOW) rim_in_cells(shape, edge, out, radius, half, end);
         }
     }
@@ -90,7 +93,7 @@ TEXT = r"""
                 n[1] = radius * twist * way[0] * way[1] - a * side[0] - b * side[1] + side[2];
                 curve = n[1] < -FLAT ? 1 / n[1] : (REAL)0;
             }
-            if (!(curve < 0 && Patch::holds(s, t))) continue;
+            if (!(curve < 0 && Patch::holds(s, t, BEYOND))) continue;
             const REAL a = patch.slope_x(t), b = patch.slope_y(s), up = on::inverse_root(1 + a * a + b * b);
             const REAL to_side = (side[2] - a * side[0] - b * side[1]) * up;
             const REAL to_end = end * (A[8] - a * A[6] - b * A[7]) * up;
@@ -114,7 +117,7 @@ TEXT = r"""
     }
 
     // ``kind`` is SIDE for a cylinder, which has faces at the ends of its axis, else 0; ``sideways``: the
-    // horizontal direction across its axis.
+    // horizontal direction across its axis if it lies.
     static CUDA_CALLABLE inline void beside_axis(
         const Field& field, Best& best, REAL slack, int kind, const REAL* sideways)
     {
@@ -160,8 +163,7 @@ TEXT = r"""
                     const bool side = away[2] >= STEEPEST * distance
                         && radius - distance <= half - on::absolute(t) + slack;
                     if (outside && !(kind ? side : away[2] > 0)) continue;
-                    const REAL v = kind ? -(sideways[0] * away[0] + sideways[1] * away[1]) : (REAL)0;
-                    REAL* row = best.take(kind ? radius - distance : -distance, t, v);
+                    REAL* row = take_beside(field, best, kind, sideways, t, away, distance);
                     if (!row) continue;
                     row[0] = kind; // of the side, or none
                     row[0] += f < 0 ? POINT : f == 0 ? LINE_Y : LINE_X, row[1] = i, row[2] = j;
@@ -171,6 +173,16 @@ TEXT = r"""
                     beside_cell(field, best, slack, kind, sideways, i, j, w);
             }
         }
+    }
+
+    // The row to write for what is ``away`` from the axis at t, or none.
+    static CUDA_CALLABLE inline REAL* take_beside(
+        const Field& field, Best& best, int kind, const REAL* sideways, REAL t, const REAL* away, REAL distance)
+    {
+        if (!kind) return best.take(-distance, t, 0);
+        const REAL depth = field.sizes[0] - distance;
+        if (sideways) return best.take(depth, t, -(sideways[0] * away[0] + sideways[1] * away[1]));
+        return best.take(depth, -field.along(0, away[0], away[1], away[2]), -field.along(1, away[0], away[1], away[2]));
     }
 
     // Where the inside of a bent cell is nearest to an axis; ``w``: from the cell's first corner to the axis' middle.
@@ -211,8 +223,7 @@ TEXT = r"""
         const bool outside = surface(field, c[0] + along * axis[0], c[1] + along * axis[1]) <= c[2] + along * axis[2];
         const bool side = away[2] >= STEEPEST * distance && radius - distance <= half - on::absolute(along) + slack;
         if (outside && !(kind ? side : away[2] > 0)) return;
-        const REAL v = kind ? -(sideways[0] * away[0] + sideways[1] * away[1]) : (REAL)0;
-        REAL* row = best.take(kind ? radius - distance : -distance, along, v);
+        REAL* row = take_beside(field, best, kind, sideways, along, away, distance);
         if (!row) return;
         row[0] = kind + INSIDE, row[1] = i, row[2] = j, row[3] = outside ? 1 : -1, row[4] = s, row[5] = inverse;
         row[6] = row[7] = row[8] = 0;

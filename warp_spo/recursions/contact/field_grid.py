@@ -14,12 +14,13 @@ from ...scene.ground import AWAY, HeightField
 from ...scene.supports import CAPSULE_GRID, CYLINDER_GRID, GRIDS
 from ...trace.scalars import Graph, Scalar, Value, floor, inverse_root, is_constant, less, reciprocal, search, select
 from ...trace.spatial import Vector, dot, total
+from ..step.joint_laws import is_number
 from .ground import GROUND, Corners, GroundOffset, Surface, clamp, upward_normal
 
 QUADRANTS, ROW = 4, 9  # rows of a search, and numbers of a row
-NONE, POINT, INSIDE, LINE_Y, FACE = 0.5, 1.5, 2.5, 3.5, 4.5
-"""Below which a row's kind is none, a point, the inside of a cell, a line along y, a face's."""
-SIDE, BESIDE = 4.0, 8.5  # added to the kinds of what the side of a cylinder touches; above: a place on its rim
+NONE, POINT, INSIDE, VERTEX, LINE_Y, FACE = 0.5, 1.5, 2.5, 3.5, 4.5, 5.5
+"""Below which a row's kind is none, a point, the inside of a cell, a corner there, a line along y, a face's."""
+SIDE, BESIDE = 5.0, 10.5  # added to the kinds of what the side of a cylinder touches; above: a place on its rim
 
 
 class Shape(NamedTuple):
@@ -77,7 +78,7 @@ def touch(
         kind = kind - SIDE * beside
     (size_x, size_y), along_y, below = ground.cells, less(kind, LINE_Y), less(kind, POINT)
     is_point = select(on_rim, 1.0, below)
-    inside = select(on_rim, 0.0, less(kind, INSIDE) - below)
+    inside = select(on_rim, 0.0, less(kind, VERTEX) - below)  # at a place of its own in a cell
     cell = Corners.of(graph, ground, place, i, j)
     corner = Vector((i * size_x, j * size_y, cell.h00))
     size = size_y if size_x == size_y else select(along_y, size_y, size_x)
@@ -87,11 +88,12 @@ def touch(
     share = select(inside, line(ground, cell, shape, corner, inside, found), 0.0)
     corner = corner + Vector((size_x, 0.0, cell.run)) * share
     rises = rises + cell.twist * share
-    given = (shape, corner, size, rises, along_y, is_point, found)
+    given = (shape, corner, size, rises, along_y)
     if rolls:
-        ways.append(_beside_axis(*given))
+        ways.append(_beside_axis(*given, is_point, found))
     if flat:
-        ways.append(_under_face(*given))
+        vertex = 0.0 if rolls else inside - less(kind, INSIDE) + below
+        ways.append(_under_face(*given, select(beside, 1.0, is_point), found, vertex, cell, size_x))
     normal, depth, seat = ways[0]
     if len(ways) > 1:
         normal, seat = (
@@ -117,7 +119,7 @@ def _crossed_line(
     x, y, s, t = along[0] * rate_x, along[1] * rate_y, at[0] * rate_x, at[1] * rate_y
     bend = 2.0 * cell.twist * (x * y)
     tilt = cell.run * x + cell.rise * y + cell.twist * (x * t + y * s) - along[2]
-    return s - x * tilt * reciprocal(select(inside, bend, 1.0))
+    return s - x * tilt * reciprocal(select(less(bend, 0.0), bend, 1.0))  # a corner has no direction
 
 
 def _nearest_line(
@@ -135,9 +137,21 @@ def _nearest_line(
 
 
 def _under_face(
-    shape: Shape, corner: Vector, size: Value, rises: Value, along_y: Value, is_point: Value, found: list[Scalar]
+    shape: Shape,
+    corner: Vector,
+    size: Value,
+    rises: Value,
+    along_y: Value,
+    is_point: Value,
+    found: list[Scalar],
+    vertex: Value,
+    cell: Corners,
+    size_x: float,
 ) -> tuple[Vector, Value, Vector]:
-    """Return normal, depth and place of a grid point under a face, or of a line that crosses an edge."""
+    """Return normal, depth and place of a grid point under a face, or of a line that crosses an edge.
+
+    ``vertex``: 1 where it is a corner of the shape on a line of ``cell`` through it.
+    """
     out, seat = (_turned(shape.axes, local) for local in (found[:3], found[3:6]))
     below = corner - shape.centre - seat  # from the face or the edge to the grid point
     depth = -dot(out, below)
@@ -146,8 +160,10 @@ def _under_face(
     rise = rises * rate
     crossed, beside = (select(along_y, below[0], below[1]), select(along_y, below[1], below[0]))
     across, aside = (select(along_y, out[0], out[1]), select(along_y, out[1], out[0]))
-    inverse = reciprocal(select(is_point, 1.0, across))
+    inverse = reciprocal(select(is_point, 1.0, select(vertex, 1.0, across)))
     slope, t = (out[2] - aside * rise) * inverse, crossed * inverse
+    if not is_number(vertex, 0.0):
+        slope = select(vertex, (cell.run - cell.twist * (below[1] * rate)) * (1.0 / size_x), slope)
     normal = upward_normal(select(along_y, slope, rise), select(along_y, rise, slope))
     height = below[2] + (t * aside - beside) * rise - t * out[2]
     normal, under = (
