@@ -63,7 +63,10 @@ TEXT = r"""
                                              const REAL* out, REAL offset)
         {
             if (!(side >= 0 && depth <= side + slack)) return;
-            REAL* row = best.take(depth, q[u], q[v]);
+            const REAL* c = field.centre;
+            const REAL over = !sideways ? q[v]
+                                        : sideways[0] * (i * field.cell[0] - c[0]) + sideways[1] * (j * field.cell[1] - c[1]);
+            REAL* row = best.take(depth, q[u], over);
             if (!row) return;
             row[0] = POINT, row[1] = i, row[2] = j;
             for (int k = 0; k < 3; ++k) row[3 + k] = out[k], row[6 + k] = offset * out[k];

@@ -3,35 +3,36 @@
 TEXT = r"""
     static CUDA_CALLABLE inline void cylinder(const REAL* table, const REAL* asked, REAL* out)
     {
-        const REAL radius = asked[13], half = asked[15], lean = asked[12];
+        const REAL radius = asked[13], half = asked[15], lean = asked[12], *axis = asked + 10;
         Polyhedron shape(table, asked, out);
         if (shape.field.is_far()) return;
         const Field& field = shape.field;
-        if (on::absolute(lean) < STANDS) {
-            const REAL inverse = on::inverse_root(field.axes[6] * field.axes[6] + field.axes[7] * field.axes[7]);
-            const REAL sideways[2] = {-field.axes[7] * inverse, field.axes[6] * inverse};
-            beside_axis(field, shape.best, shape.slack, SIDE, sideways);
+        const bool lies = on::absolute(lean) < STANDS, leans = on::absolute(lean) <= LEANS;
+        REAL sideways[2] = {0, 0};
+        if (lies) {
+            const REAL inverse = on::inverse_root(axis[0] * axis[0] + axis[1] * axis[1]);
+            sideways[0] = -axis[1] * inverse, sideways[1] = axis[0] * inverse;
             shape.u = 2, shape.sideways = sideways;
-            LOOP
-            for (int end = -1; end < 2; end += 2) rim(shape, radius, half, end);
-            return;
         }
+        if (leans) beside_axis(field, shape.best, 0, SIDE, shape.sideways);
         const int end = lean > 0 ? -1 : 1;
-        const REAL down[3] = {0, 0, (REAL)end};
-        LOOP
-        for (int i = field.low[0]; i <= field.high[0]; ++i) {
+        if (on::absolute(lean) >= DOWN) {
+            const REAL down[3] = {0, 0, (REAL)end};
+            if (leans) shape.slack = 0;
             LOOP
-            for (int j = field.low[1]; j <= field.high[1]; ++j) {
-                REAL q[3];
-                shape.from_middle(i, j, q);
-                const REAL side = radius - on::sqrt(q[0] * q[0] + q[1] * q[1]);
-                shape.take_point(i, j, q, half - down[2] * q[2], side, down, half);
+            for (int i = field.low[0]; i <= field.high[0]; ++i) {
+                LOOP
+                for (int j = field.low[1]; j <= field.high[1]; ++j) {
+                    REAL q[3];
+                    shape.from_middle(i, j, q);
+                    const REAL side = radius - on::sqrt(q[0] * q[0] + q[1] * q[1]);
+                    shape.take_point(i, j, q, half - down[2] * q[2], side, down, half);
+                }
             }
+            shape.slack = SLACK * least(radius, half);
         }
         rim(shape, radius, half, end);
-        if (on::absolute(lean) > LEANS) return;
-        rim(shape, radius, half, -end);
-        beside_axis(field, shape.best, shape.slack, SIDE, nullptr);
+        if (leans) rim(shape, radius, half, -end);
     }
 
     // The rim of a cylinder at the end -1 or 1 of its axis, as so many edges.
