@@ -15,14 +15,14 @@ from .elementary import C_TYPE
 
 NAME = "grid_search"
 RULES = {
-    "OUTWARD": 1e-3, "TIE": 1e-6, "DOWN": 0.5, "ACROSS": 0.17, "BESIDE": 0.35, "SLACK": 0.5, "PARALLEL": 1e-6,
+    "OUTWARD": 1e-3, "TIE": 1e-6, "DOWN": 0.5, "ACROSS": 0.17, "PASSES": 0.02, "BESIDE": 0.35, "SLACK": 0.5, "PARALLEL": 1e-6,
     "FAR": 1e30, "APART": 0.94 * 0.94, "ABOVE": 0.5, "STANDS": 0.7, "PI": math.pi, "LOW": 0.1, "STEEPEST": 0.1, "LEANS": 0.95,
    
-    "LEAN": math.tan(hull_corners.LEAN), "NEARER": 1.0 - 1e-6, "FLAT": 1e-4, "BENT": 4e-4, "NEAR": 1e-3, "BEYOND": 0.01,
+    "LEAN": math.tan(hull_corners.LEAN), "NEARER": 1.0 - 1e-6, "FLAT": 1e-4, "BENT": 4e-4, "NEAR": 1e-3,
 }  # fmt: skip
 KINDS = {
     "QUADRANTS": 4, "ROW": 9, "POINT": 1, "INSIDE": 2, "VERTEX": 3, "LINE_Y": 4, "LINE_X": 5, "SIDE": 5, "RIMS": 11,
-    "EDGES": 32, "STEPS": 2, "TURNS": 4, "NEARINGS": 6, "CHOSEN": hull_corners.ROWS,
+    "EDGES": 32, "STEPS": 2, "TURNS": 3, "NEARINGS": 6, "CHOSEN": hull_corners.ROWS,
 }  # fmt: skip
 
 
@@ -172,10 +172,7 @@ GRID = r"""
         // How far in the cell a place is, along x (f = 0) or y, in cells.
         CUDA_CALLABLE inline REAL part(REAL x, int f) const { return x / cell[f] - (f == 0 ? i : j); }
 
-        static CUDA_CALLABLE inline bool holds(REAL s, REAL t, REAL more = 0)
-        {
-            return s >= -more && s <= 1 + more && t >= -more && t <= 1 + more;
-        }
+        static CUDA_CALLABLE inline bool holds(REAL s, REAL t) { return s >= 0 && s <= 1 && t >= 0 && t <= 1; }
     };
 
     // The cells that a straight line passes, seen from above: row after row along x, in each along y.
@@ -183,7 +180,7 @@ GRID = r"""
     {
         const Field& field;
         const REAL *at, *along;
-        REAL half;
+        REAL half, from, to; // in the row
         int i, j, last_i, last_j;
 
         CUDA_CALLABLE inline Passed(const Field& of, const REAL* middle, const REAL* direction, REAL length)
@@ -194,17 +191,22 @@ GRID = r"""
             --i;
         }
 
+        // Narrows a part of the line to where it is in row i along x (f = 0), or in column i.
+        CUDA_CALLABLE inline void within(int f, int i, REAL& first, REAL& last) const
+        {
+            if (!(on::absolute(along[f]) > PARALLEL)) return;
+            const REAL a = (i * field.cell[f] - at[f]) / along[f], b = a + field.cell[f] / along[f];
+            first = -least(-least(a, b), -first), last = least(-least(-a, -b), last);
+        }
+
         CUDA_CALLABLE inline bool next()
         {
             ++j;
             while (j >= last_j) {
                 ++i;
                 if (i >= last_i) return false;
-                REAL from = -half, to = half;
-                if (on::absolute(along[0]) > NEAR) {
-                    const REAL a = (i * field.cell[0] - at[0]) / along[0], more = field.cell[0] / along[0];
-                    from = -least(-least(a, a + more), half), to = least(-least(-a, -a - more), half);
-                }
+                from = -half, to = half;
+                within(0, i, from, to);
                 const REAL a = at[1] + from * along[1], b = at[1] + to * along[1];
                 field.between(least(a, b), -least(-a, -b), 1, true, j, last_j);
             }

@@ -83,7 +83,7 @@ TEXT = r"""
                 const REAL *at = edge.at, *along = edge.along;
                 const REAL across = f == 0 ? along[0] : along[1], aside = f == 0 ? along[1] : along[0];
                 const REAL at_f = f == 0 ? at[0] : at[1], at_o = f == 0 ? at[1] : at[0];
-                if (!(on::absolute(across) >= ACROSS)) continue;
+                if (!(on::absolute(across) >= PASSES)) continue;
                 const REAL wide = on::absolute(across) * half;
                 int line, last;
                 field.between(at_f - wide, at_f + wide, f, false, line, last);
@@ -100,7 +100,8 @@ TEXT = r"""
                     const REAL nf = -slope * up, no = -rise * up, x = f == 0 ? nf : no, y = f == 0 ? no : nf;
                     const REAL depth = (field.height(i, j) + (place - m) * rises - at[2] - t * along[2]) * up;
                     if (!edge.carries(x, y, up) || depth > half - on::absolute(t) + slack) continue;
-                    const bool gentle = edge.lowest <= -DOWN && on::absolute(rise) <= 1 && up >= DOWN;
+                    const bool gentle = edge.lowest <= -DOWN && on::absolute(rise) <= 1 && up >= DOWN
+                        && on::absolute(across) >= ACROSS;
                     if (!gentle) { // only on a crease, where the field falls away on both sides
                         const REAL turn = t * round, on_f = across - turn * (f == 0 ? edge.one[0] : edge.one[1]);
                         const REAL on_o = aside - turn * (f == 0 ? edge.one[1] : edge.one[0]);

@@ -48,65 +48,71 @@ TEXT = r"""
             const REAL far = radius * share[0], seat[3] = {far * out[0], far * out[1], half * face[2]};
             const Edge edge(shape.field, seat, local, out, face);
             shape.cross(edge, seat, local, radius * share[1], 1 / radius);
-            if (edge.lowest <= -LOW) rim_in_cells(shape, edge, out, radius, half, end);
+            if (edge.lowest <= -LOW) rim_in_cells(shape, edge, out, radius * share[1], end);
         }
     }
 
+    // A place on the rim of a cylinder, at an angle from the middle of one of its edges, over a cell: how steeply the
+    // rim falls into the ground there, and how that changes on the way, per radius.
+    struct RimPlace
+    {
+        REAL turn[2], side[3], place[3], s, t, grade, curve;
+
+        CUDA_CALLABLE inline RimPlace(const Field& field, const Patch& patch, const Edge& edge, int end, REAL angle)
+        {
+            const REAL radius = field.sizes[0];
+            on::sincos(angle, turn[1], turn[0]);
+            REAL way[3];
+            for (int f = 0; f < 3; ++f) {
+                side[f] = turn[0] * edge.one[f] + turn[1] * edge.along[f];
+                way[f] = turn[0] * edge.along[f] - turn[1] * edge.one[f];
+                place[f] = end * field.sizes[2] * field.axes[6 + f] + radius * side[f];
+            }
+            s = patch.part(field.centre[0] + place[0], 0), t = patch.part(field.centre[1] + place[1], 1);
+            const REAL a = patch.slope_x(t), b = patch.slope_y(s);
+            const REAL twist = 2 * patch.twist / (patch.cell[0] * patch.cell[1]);
+            grade = a * way[0] + b * way[1] - way[2];
+            curve = radius * twist * way[0] * way[1] - a * side[0] - b * side[1] + side[2];
+        }
+    };
+
     // Where a rim is farthest below the inside of a cell: near this edge of it, which is about the direction ``out``.
     static CUDA_CALLABLE inline void rim_in_cells(
-        Polyhedron& shape, const Edge& edge, const REAL* out, REAL radius, REAL half, int end)
+        Polyhedron& shape, const Edge& edge, const REAL* out, REAL width, int end)
     {
         const Field& field = shape.field;
-        const REAL *c = field.centre, *A = field.axes, *at = edge.at, *along = edge.along, *one = edge.one;
-        REAL share[2], next[3];
-        on::sincos(2 * PI / EDGES, share[1], share[0]);
-        for (int x = 0; x < 3; ++x) next[x] = share[0] * along[x] - share[1] * one[x];
-        on::sincos(PI / EDGES, share[1], share[0]);
-        const REAL width = radius * share[1];
+        const REAL *A = field.axes, radius = field.sizes[0], half = field.sizes[2], per = PI / EDGES / width;
         LOOP
-        for (Passed cells(field, at, along, width); cells.next();) {
+        for (Passed cells(field, edge.at, edge.along, width); cells.next();) {
             const Patch patch(field, cells.i, cells.j);
-            const REAL x = along[0] / field.cell[0], y = along[1] / field.cell[1], bend = 2 * patch.twist * x * y;
-            REAL s = patch.part(at[0], 0), t = patch.part(at[1], 1);
-            const REAL tilt = patch.run * x + patch.rise * y + patch.twist * (x * t + y * s) - along[2];
-            REAL from = width; // along the edge to where the search begins: its end, or where the edge is farthest below
-            if (on::absolute(tilt) < -bend * width) from = -tilt / bend;
-            s += from * x, t += from * y;
-            if (!Patch::holds(s, t)) continue;
-            if (from == width) {
-                const REAL then = patch.slope_x(t) * next[0] + patch.slope_y(s) * next[1] - next[2];
-                if (!(tilt + bend * width > 0 && then <= 0)) continue;
-            }
-            REAL angle = from / radius, turn[2], place[3], n[2], side[3], curve = 0;
+            REAL first = cells.from, last = cells.to;
+            cells.within(1, cells.j, first, last);
+            if (!(first < last)) continue;
+            const REAL begin = RimPlace(field, patch, edge, end, first * per).grade;
+            const REAL stop = RimPlace(field, patch, edge, end, last * per).grade;
+            if (!(begin > 0 && stop <= 0)) continue;
+            REAL angle = (first + (last - first) * begin / (begin - stop)) * per;
             LOOP
             for (int step = 0; step < TURNS; ++step) {
-                if (step) angle -= n[0] * curve;
-                on::sincos(angle, turn[1], turn[0]);
-                REAL way[3];
-                for (int f = 0; f < 3; ++f) {
-                    side[f] = turn[0] * one[f] + turn[1] * along[f], way[f] = turn[0] * along[f] - turn[1] * one[f];
-                    place[f] = end * half * A[6 + f] + radius * side[f];
-                }
-                s = patch.part(c[0] + place[0], 0), t = patch.part(c[1] + place[1], 1);
-                const REAL a = patch.slope_x(t), b = patch.slope_y(s);
-                const REAL twist = 2 * patch.twist / (field.cell[0] * field.cell[1]);
-                n[0] = a * way[0] + b * way[1] - way[2];
-                n[1] = radius * twist * way[0] * way[1] - a * side[0] - b * side[1] + side[2];
-                curve = n[1] < -FLAT ? 1 / n[1] : (REAL)0;
+                const RimPlace at(field, patch, edge, end, angle);
+                if (at.curve < -FLAT) angle -= at.grade / at.curve;
+                angle = -least(-least(angle, last * per), -first * per);
             }
-            if (!(curve < 0 && Patch::holds(s, t, BEYOND))) continue;
-            const REAL a = patch.slope_x(t), b = patch.slope_y(s), up = on::inverse_root(1 + a * a + b * b);
-            const REAL to_side = (side[2] - a * side[0] - b * side[1]) * up;
+            const RimPlace at(field, patch, edge, end, angle);
+            if (!(at.curve < -FLAT)) continue;
+            const REAL a = patch.slope_x(at.t), b = patch.slope_y(at.s), up = on::inverse_root(1 + a * a + b * b);
+            const REAL to_side = (at.side[2] - a * at.side[0] - b * at.side[1]) * up;
             const REAL to_end = end * (A[8] - a * A[6] - b * A[7]) * up;
             if (!(up >= STEEPEST && to_side <= BESIDE && to_end <= BESIDE)) continue;
-            const REAL depth = (patch.height(s, t) - c[2] - place[2]) * up;
-            const REAL u[2] = {turn[0] * out[0] - turn[1] * out[1], turn[0] * out[1] + turn[1] * out[0]};
+            const REAL depth = (patch.height(at.s, at.t) - field.centre[2] - at.place[2]) * up;
+            const REAL x = at.turn[0] * out[0] - at.turn[1] * out[1], y = at.turn[0] * out[1] + at.turn[1] * out[0];
             const REAL* sideways = shape.sideways;
-            REAL* row = sideways ? shape.best.take(depth, end * half, sideways[0] * place[0] + sideways[1] * place[1])
-                                 : shape.best.take(depth, radius * u[0], radius * u[1]);
+            REAL* row = sideways
+                ? shape.best.take(depth, end * half, sideways[0] * at.place[0] + sideways[1] * at.place[1])
+                : shape.best.take(depth, radius * x, radius * y);
             if (!row) continue;
-            row[0] = RIMS, row[1] = patch.i, row[2] = patch.j, row[3] = end, row[4] = u[0], row[5] = u[1];
-            row[6] = curve, row[7] = row[8] = 0;
+            row[0] = RIMS, row[1] = patch.i, row[2] = patch.j, row[3] = end, row[4] = x, row[5] = y;
+            row[6] = 1 / at.curve, row[7] = row[8] = 0;
         }
     }
 
