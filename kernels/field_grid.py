@@ -215,6 +215,8 @@ GRID = r"""
     };
 """
 
-NATIVE = "\nstruct grid_search\n{\n" + "\n".join(
-    [GRID, field_grid_polyhedra.TEXT, field_grid_rounds.TEXT, field_grid_points.TEXT]
-) + "};\n"
+NATIVE = (
+    "\nstruct grid_search\n{\n"
+    + "\n".join([GRID, field_grid_polyhedra.TEXT, field_grid_rounds.TEXT, field_grid_points.TEXT])
+    + "};\n"
+)
