@@ -1,7 +1,7 @@
 """The specification of where edges and corners of shapes touch the bilinear cells of a height field, and their lines.
 
-Along an edge the field is quadratic in each cell. Seen from the edge it has its tops where the edge crosses a line of the
-grid, and inside of a cell that is bent downward along the edge. There the normal is that of the field's surface.
+Along an edge the field is quadratic in each cell. Seen from the edge it has its tops where the edge crosses a line of
+the grid, and inside of a cell that is bent downward along the edge. There the normal is that of the field's surface.
 """
 
 import numpy as np
