@@ -15,14 +15,14 @@ from .elementary import C_TYPE
 
 NAME = "grid_search"
 RULES = {
-    "OUTWARD": 1e-3, "TIE": 1e-6, "DOWN": 0.5, "ACROSS": 0.17, "PASSES": 0.02, "BESIDE": 0.35, "SLACK": 0.5, "PARALLEL": 1e-6,
-    "FAR": 1e30, "APART": 0.94 * 0.94, "ABOVE": 0.5, "STANDS": 0.7, "PI": math.pi, "LOW": 0.1, "STEEPEST": 0.1, "LEANS": 0.95,
-   
-    "LEAN": math.tan(hull_corners.LEAN), "NEARER": 1.0 - 1e-6, "FLAT": 1e-4, "BENT": 4e-4, "NEAR": 1e-3,
+    "OUTWARD": 1e-3, "TIE": 1e-6, "DOWN": 0.5, "LOW": 0.1, "ACROSS": 0.17, "PASSES": 0.02, "BESIDE": 0.35,
+    "STEEPEST": 0.1, "SLACK": 0.5, "PARALLEL": 1e-6, "FAR": 1e30, "ABOVE": 0.5, "STANDS": 0.7, "LEANS": 0.95,
+    "FLAT": 1e-4, "BENT": 4e-4, "NEAR": 1e-3, "STRONG": 0.2, "DEFINITE": 0.9, "APART": 0.94 * 0.94,
+    "NEARER": 1.0 - 1e-6, "LEAN": math.tan(hull_corners.LEAN), "PI": math.pi,
 }  # fmt: skip
 KINDS = {
     "QUADRANTS": 4, "ROW": 9, "POINT": 1, "INSIDE": 2, "VERTEX": 3, "LINE_Y": 4, "LINE_X": 5, "SIDE": 5, "RIMS": 11,
-    "EDGES": 32, "STEPS": 2, "TURNS": 3, "NEARINGS": 6, "CHOSEN": hull_corners.ROWS,
+    "EDGES": 32, "STEPS": 2, "MORE": 4, "PLACE": 7, "TURNS": 3, "NEARINGS": 6, "CHOSEN": hull_corners.ROWS,
 }  # fmt: skip
 
 
@@ -69,8 +69,8 @@ GRID = r"""
             return at[1 + f] - at[0];
         }
 
-        // The slope across a line at constant x (f = 0) or y in the cell before it (beside = -1) or after it (0), by its
-        // place on the line, in cell m; level beyond the edges.
+        // The slope across a line at constant x (f = 0) or y in the cell before it (beside = -1) or after it (0), at a part
+        // of cell m along it; level beyond the edges.
         CUDA_CALLABLE inline REAL slope_beside(int line, int m, REAL part, int f, int beside) const
         {
             const int n = line + beside;

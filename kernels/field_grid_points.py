@@ -1,35 +1,43 @@
 """Spheres over the cells of a height field, corners of hulls over it, and its height at a place."""
 
 TEXT = r"""
-    // The nearest point of a cell to a sphere's centre: the way from there to the centre, and whether that is above.
+    // The nearest point of a cell to a sphere's centre: the way from there to the centre, whether that is above, the
+    // place, and along which axes it may move.
     struct Foot
     {
-        REAL away[3], square;
+        REAL away[3], square, place[2], free[2];
         bool outside;
 
-        CUDA_CALLABLE inline Foot(const REAL* h, const REAL* cell, REAL x, REAL y, REAL z, int steps)
+        CUDA_CALLABLE inline Foot(const REAL* h, const REAL* cell, REAL x, REAL y, REAL z)
         {
-            const REAL per_x = 1 / cell[0], per_y = 1 / cell[1];
+            const REAL per_x = 1 / cell[0], per_y = 1 / cell[1], rest = h[0] - h[2] - h[1] + h[3];
             const REAL run = (h[2] - h[0]) * per_x, rise = (h[1] - h[0]) * per_y;
-            const REAL twist = (h[0] - h[2] - h[1] + h[3]) * (per_x * per_y), above = z - h[0];
-            REAL s = inside(x, cell[0]), t = inside(y, cell[1]);
+            const REAL twist = rest * (per_x * per_y), above = z - h[0];
+            const bool strong = on::absolute(rest) > STRONG * least(cell[0], cell[1]);
+            REAL s = inside(x, cell[0]), t = inside(y, cell[1]), a, b, w;
+            if (strong) s = (REAL)0.5 * s + (REAL)0.25 * cell[0], t = (REAL)0.5 * t + (REAL)0.25 * cell[1];
+            const int steps = strong ? MORE : STEPS;
+            bool definite = false;
             LOOP
-            for (int step = 0; step < steps; ++step) {
-                const REAL a = run + twist * t, b = rise + twist * s, w = above - run * s - b * t;
+            for (int step = 0; ; ++step) {
+                a = run + twist * t, b = rise + twist * s, w = above - run * s - b * t;
+                const REAL along_x = a * a + 1, along_y = b * b + 1, exact = a * b - w * twist;
+                const REAL most = DEFINITE * on::sqrt(along_x * along_y);
+                definite = on::absolute(exact) <= most;
+                if (step == steps) break;
+                const REAL both = definite ? exact : exact > 0 ? most : -most;
                 const REAL right_x = (x - s) + a * w, right_y = (y - t) + b * w;
-                const REAL along_x = a * a + 1, along_y = b * b + 1, both = a * b, inverse = 1 / (along_x + b * b);
-                if (step % 2 == 0) {
-                    const REAL next = inside(s + (along_y * right_x - both * right_y) * inverse, cell[0]);
-                    t = inside(t + (right_y - both * (next - s)) / along_y, cell[1]);
-                    s = next;
-                } else {
-                    const REAL next = inside(t + (along_x * right_y - both * right_x) * inverse, cell[1]);
-                    s = inside(s + (right_x - both * (next - t)) / along_x, cell[0]);
-                    t = next;
-                }
+                const REAL inverse = 1 / (along_x * along_y - both * both);
+                const REAL to_s = s + (along_y * right_x - both * right_y) * inverse;
+                const REAL to_t = t + (along_x * right_y - both * right_x) * inverse;
+                REAL next_s = inside(to_s, cell[0]), next_t = inside(to_t, cell[1]);
+                if (next_t != to_t) next_s = inside(s + (right_x - both * (next_t - t)) / along_x, cell[0]);
+                if (next_s != to_s) next_t = inside(t + (right_y - both * (next_s - s)) / along_y, cell[1]);
+                s = next_s, t = next_t;
             }
-            const REAL a = run + twist * t, b = rise + twist * s;
-            away[0] = x - s, away[1] = y - t, away[2] = above - run * s - b * t;
+            away[0] = x - s, away[1] = y - t, away[2] = w;
+            place[0] = s, place[1] = t;
+            free[0] = definite && s > 0 && s < cell[0], free[1] = definite && t > 0 && t < cell[1];
             square = along(*this);
             outside = away[2] - a * away[0] - b * away[1] > 0;
         }
@@ -56,7 +64,8 @@ TEXT = r"""
     }
 
     // Asked are the first height, the centre from there, the cell, points along x and y, how many cells to each side
-    // are tried, and whether for a second one; found are the nearest cell, the second, and whether that is there.
+    // are tried, and whether for a second one; found are the place in the nearest cell, and the second: whether it is
+    // there, the cell, the place in it, and whether that may move along x and y.
     static CUDA_CALLABLE inline void sphere(const REAL* table, const REAL* asked, REAL* out)
     {
         const REAL *cells = table + 4ll * (int)asked[0], *size = asked + 4;
@@ -70,33 +79,29 @@ TEXT = r"""
             middle[f] = (int)(at[f] + ring + (REAL)0.5) - ring;
         }
         REAL first[3] = {0, 0, 0}, square = 0;
-        out[2] = out[3] = 0;
+        bool above = true;
+        for (int n = 0; n < 2 * PLACE; ++n) out[n] = 0;
         LOOP
         for (int round = 0; round < 1 + (int)asked[9]; ++round) { // the second looks away from what the first found
-            REAL least = FAR;
-            int best[2] = {0, 0};
+            REAL nearest = FAR, *row = out + PLACE * round;
+            if (!above) break;
             LOOP
             for (int n = 0; n < 4 * ring * ring; ++n) {
                 const int each[2] = {middle[0] - ring + n / (2 * ring), middle[1] - ring + n % (2 * ring)};
                 levelled(cells, each, last, corners);
-                const Foot foot(
-                    corners, size, (at[0] - each[0]) * size[0], (at[1] - each[1]) * size[1], asked[3], STEPS);
+                const Foot foot(corners, size, (at[0] - each[0]) * size[0], (at[1] - each[1]) * size[1], asked[3]);
                 if (round) {
                     const REAL turned = foot.away[0] * first[0] + foot.away[1] * first[1] + foot.away[2] * first[2];
                     if (!foot.outside || !(turned < 0 || turned * turned < APART * foot.square * square)) continue;
                 }
-                if (foot.square < NEARER * least) least = foot.square, best[0] = each[0], best[1] = each[1];
+                if (!(foot.square < NEARER * nearest)) continue;
+                nearest = foot.square, above = round || foot.outside;
+                row[0] = 1;
+                for (int f = 0; f < 2; ++f) row[1 + f] = each[f], row[3 + f] = foot.place[f], row[5 + f] = foot.free[f];
+                if (round) continue;
+                for (int x = 0; x < 3; ++x) first[x] = foot.away[x];
+                square = foot.square;
             }
-            out[2 * round] = best[0], out[2 * round + 1] = best[1];
-            if (round) {
-                if (!(least < FAR)) out[4] = 0;
-                continue;
-            }
-            levelled(cells, best, last, corners);
-            const Foot foot(
-                corners, size, (at[0] - best[0]) * size[0], (at[1] - best[1]) * size[1], asked[3], STEPS + 1);
-            for (int x = 0; x < 3; ++x) first[x] = foot.away[x];
-            square = foot.square, out[4] = foot.outside;
         }
     }
 

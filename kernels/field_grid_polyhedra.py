@@ -22,7 +22,8 @@ TEXT = r"""
         // Whether it may touch a surface with this normal: no face of it looks up along that.
         CUDA_CALLABLE inline bool carries(REAL x, REAL y, REAL z) const
         {
-            return one[0] * x + one[1] * y + one[2] * z <= BESIDE && other[0] * x + other[1] * y + other[2] * z <= BESIDE;
+            const REAL first = one[0] * x + one[1] * y + one[2] * z, second = other[0] * x + other[1] * y + other[2] * z;
+            return first <= BESIDE && second <= BESIDE;
         }
     };
 
@@ -64,8 +65,8 @@ TEXT = r"""
         {
             if (!(side >= 0 && depth <= side + slack)) return;
             const REAL* c = field.centre;
-            const REAL over = !sideways ? q[v]
-                                        : sideways[0] * (i * field.cell[0] - c[0]) + sideways[1] * (j * field.cell[1] - c[1]);
+            const REAL x = i * field.cell[0] - c[0], y = j * field.cell[1] - c[1];
+            const REAL over = sideways ? sideways[0] * x + sideways[1] * y : q[v];
             REAL* row = best.take(depth, q[u], over);
             if (!row) return;
             row[0] = POINT, row[1] = i, row[2] = j;

@@ -231,9 +231,9 @@ def surfaces(field, at, number=0, moves=(0.0, 0.0, 0.0), walls=True):
     """Return normal and depth of the surfaces of a height field near a point that the step takes by ``moves``.
 
     They are the field's own, or a floor and a wall where the middle slope of the cell exceeds 1. The wall is the plane
-    that touches the cell there, and ends at its highest corner. Beyond an edge the field is level across it. A cell without a wall is followed by the wall of the
-    cell where the step takes the point, if that rises along ``moves``. Of a set of fields it is that of this number.
-    Without ``walls`` they are the field's own.
+    that touches the cell there, and ends at its highest corner. Beyond an edge the field is level across it. A cell
+    without a wall is followed by the wall of the cell where the step takes the point, if that rises along ``moves``. Of
+    a set of fields it is that of this number. Without ``walls`` they are the field's own.
     """
     h, place = field.heights.reshape(-1, *field.heights.shape[-2:])[number], at[:2] - field.origin[:2]
     place, ahead = place / field.cell, (place + moves[:2]) / field.cell

@@ -6,6 +6,8 @@ the grid, and inside of a cell that is bent downward along the edge. There the n
 
 import numpy as np
 
+from .field_cells import over_cell, twist_of
+
 NONE, POINT, INSIDE, VERTEX, LINE_Y, LINE_X = 0.0, 1.0, 2.0, 3.0, 4.0, 5.0
 """Kinds: a grid point; the inside of the cell from there; a corner of the shape in it; its lines along y, and x."""
 SIDE, RIMS = 5.0, 11.0  # added to the kinds of what the side of a cylinder touches; kind of a place on a rim
@@ -187,18 +189,6 @@ def _corners(field, cell, centre, axes, edge, sides, lower):
         if steep and n[2] >= STEEPEST and carries(axes, both, n):
             found.append((depth, *sides(place), [VERTEX, i, j, 0.0, 0.0, 0.0, *place]))
     return found
-
-
-def twist_of(corners):
-    """Return how far the last corner of a cell [2, 2] is above the plane of the others [m]."""
-    return corners[0, 0] - corners[0, 1] - corners[1, 0] + corners[1, 1]
-
-
-def over_cell(corners, cell, s, t):
-    """Return the slopes along x and y, and the height, of a cell's surface at a place in it."""
-    slope_x = np.array([1.0 - t, t]) @ (corners[1] - corners[0]) / cell[0]
-    slope_y = np.array([1.0 - s, s]) @ (corners[:, 1] - corners[:, 0]) / cell[1]
-    return np.array([slope_x, slope_y]), np.array([1.0 - s, s]) @ corners @ np.array([1.0 - t, t])
 
 
 def in_cell(corners, cell, s, t, z):

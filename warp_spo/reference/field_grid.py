@@ -12,7 +12,7 @@ What is found is discrete: which point or line, and which face or edge. Where it
 import numpy as np
 
 from . import hull_corners
-from .field_cells import cell_corners
+from .field_cells import cell_corners, over_cell, twist_of
 from .field_edges import (
     INSIDE,
     LINE_Y,
@@ -24,9 +24,7 @@ from .field_edges import (
     VERTEX,
     between,
     in_cell,
-    over_cell,
     polyhedron,
-    twist_of,
 )
 from .field_rounds import RimPlace, capsule, cylinder, line_of_cell, nearest_on_line
 from .field_spheres import find_cells
@@ -102,7 +100,7 @@ def _hull(field, cell, centre, axes, half, table):
 
 
 def _sphere(heights, numbers):
-    """Return the two cells that a sphere may touch, as :func:`.field_spheres.find_cells`.
+    """Return the two places that a sphere may touch, as :func:`.field_spheres.find_cells`.
 
     ``numbers``: of the first height; the centre (3) [m]; the cell (2) [m]; points along x and y; how many cells to
     each side are tried; whether for a second cell.

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from .field_cells import over_cell, twist_of
 from .field_edges import (
     BENT,
     BESIDE,
@@ -20,9 +21,7 @@ from .field_edges import (
     crossings,
     in_cell,
     looks_down,
-    over_cell,
     points,
-    twist_of,
 )
 
 RIM = 32  # edges that stand for a rim
