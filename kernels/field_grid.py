@@ -69,8 +69,8 @@ GRID = r"""
             return at[1 + f] - at[0];
         }
 
-        // The slope across a line at constant x (f = 0) or y in the cell before it (beside = -1) or after it (0), at a part
-        // of cell m along it; level beyond the edges.
+        // The slope across a line at constant x (f = 0) or y in the cell before it (beside = -1) or after it (0), at a
+        // part of cell m along it; level beyond the edges.
         CUDA_CALLABLE inline REAL slope_beside(int line, int m, REAL part, int f, int beside) const
         {
             const int n = line + beside;

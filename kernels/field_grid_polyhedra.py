@@ -22,8 +22,8 @@ TEXT = r"""
         // Whether it may touch a surface with this normal: no face of it looks up along that.
         CUDA_CALLABLE inline bool carries(REAL x, REAL y, REAL z) const
         {
-            const REAL first = one[0] * x + one[1] * y + one[2] * z, second = other[0] * x + other[1] * y + other[2] * z;
-            return first <= BESIDE && second <= BESIDE;
+            const REAL first = one[0] * x + one[1] * y + one[2] * z;
+            return first <= BESIDE && other[0] * x + other[1] * y + other[2] * z <= BESIDE;
         }
     };
 
