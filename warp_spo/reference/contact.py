@@ -230,10 +230,10 @@ def _slip(n, x):
 def surfaces(field, at, number=0, moves=(0.0, 0.0, 0.0), walls=True):
     """Return normal and depth of the surfaces of a height field near a point that the step takes by ``moves``.
 
-    They are the field's own, or a floor and a wall where the middle slope of the cell exceeds 1. The wall ends at the
-    highest corner. Beyond an edge the field is level across it. A cell without a wall is followed by the wall of the
-    cell where the step takes the point, if that rises along ``moves``. Of a set of fields it is that of this number.
-    Without ``walls`` they are the field's own.
+    They are the field's own, or a floor and a wall where the middle slope of the cell exceeds 1. The wall is the plane
+    that touches the cell there, and ends at its highest corner. Beyond an edge the field is level across it. A cell
+    without a wall is followed by the wall of the cell where the step takes the point, if that rises along ``moves``. Of
+    a set of fields it is that of this number. Without ``walls`` they are the field's own.
     """
     h, place = field.heights.reshape(-1, *field.heights.shape[-2:])[number], at[:2] - field.origin[:2]
     place, ahead = place / field.cell, (place + moves[:2]) / field.cell
@@ -247,19 +247,28 @@ def surfaces(field, at, number=0, moves=(0.0, 0.0, 0.0), walls=True):
         middle = np.array([corners[1] - corners[0], corners[:, 1] - corners[:, 0]]).mean(axis=1) / field.cell
         return corners, middle, place - first
 
-    def wall(corners, middle, inside):
-        plane = corners.mean() + field.cell * middle @ (inside - 0.5)
-        return [(upward(middle), (plane - z) * upward(middle)[2])] if z <= corners.max() else []
+    def over(corners, s, t):
+        """The height of a cell's surface at a place, and its slope there."""
+        height = np.array([1.0 - s, s]) @ corners @ np.array([1.0 - t, t])
+        slope_x = np.array([1.0 - t, t]) @ (corners[1] - corners[0])
+        slope_y = np.array([1.0 - s, s]) @ (corners[:, 1] - corners[:, 0])
+        return height, np.array([slope_x, slope_y]) / field.cell
+
+    def wall(corners, inside):
+        """The plane that touches a cell where it is nearest to the place, and its slope."""
+        nearest = np.clip(inside, 0.0, 1.0)
+        height, slope = over(corners, *nearest)
+        plane = height + slope @ (inside - nearest) * field.cell
+        return [(upward(slope), (plane - z) * upward(slope)[2])] if z <= corners.max() else [], slope
 
     corners, middle, (s, t) = cell(place)
     if walls and np.linalg.norm(middle) > 1.0:
-        return [(np.array([0.0, 0.0, 1.0]), corners.min() - z), *wall(corners, middle, np.array([s, t]))]
-    height = np.array([1.0 - s, s]) @ corners @ np.array([1.0 - t, t])
-    slope = np.array([np.array([1.0 - t, t]) @ (corners[1] - corners[0]),
-                      np.array([1.0 - s, s]) @ (corners[:, 1] - corners[:, 0])]) / field.cell  # fmt: skip
-    after = cell(ahead)
-    rises = walls and np.linalg.norm(after[1]) > 1.0 and after[1] @ moves[:2] > 0.0
-    return [(upward(slope), (height - z) * upward(slope)[2]), *(wall(*after) if rises else [])]
+        return [(np.array([0.0, 0.0, 1.0]), corners.min() - z), *wall(corners, np.array([s, t]))[0]]
+    height, slope = over(corners, s, t)
+    corners, middle, inside = cell(ahead)
+    found, rising = wall(corners, inside)
+    rises = walls and np.linalg.norm(middle) > 1.0 and rising @ moves[:2] > 0.0
+    return [(upward(slope), (height - z) * upward(slope)[2]), *(found if rises else [])]
 
 
 def upward(field, at, number=0):
