@@ -102,7 +102,8 @@ TEXT = r"""
         LOOP
         for (int round = 0; round < 2; ++round) { // the second looks away from what the first found
             REAL* row = out + PLACE * round;
-            row[0] = 1, row[1] = middle[0] - ring + nearest / (2 * ring), row[2] = middle[1] - ring + nearest % (2 * ring);
+            row[0] = 1, row[1] = middle[0] - ring + nearest / (2 * ring);
+            row[2] = middle[1] - ring + nearest % (2 * ring);
             for (int f = 0; f < 4; ++f) row[3 + f] = places[nearest][f];
             if (round || !(int)asked[9] || !above || !(found < FAR)) return;
             const REAL square = found;

@@ -22,7 +22,6 @@ from .field_edges import (
     SIDE,
     SLACK,
     VERTEX,
-    between,
     in_cell,
     polyhedron,
 )
