@@ -258,7 +258,7 @@ def surfaces(field, at, number=0, moves=(0.0, 0.0, 0.0), walls=True):
         """The plane that touches a cell where it is nearest to the place, and its slope."""
         nearest = np.clip(inside, 0.0, 1.0)
         height, slope = over(corners, *nearest)
-        plane = height + slope @ (inside - nearest) * field.cell
+        plane = height + slope @ (np.array(field.cells) * (inside - nearest))
         return [(upward(slope), (plane - z) * upward(slope)[2])] if z <= corners.max() else [], slope
 
     corners, middle, (s, t) = cell(place)
