@@ -66,7 +66,7 @@ TEXT = r"""
     // Asked are the first height, the centre from there, the cell, points along x and y, how many cells to each side
     // are tried, whether for a second one, and how far below the centre the field matters; found are the place in the
     // nearest cell, and the second: whether it is there, the cell, the place in it, and whether that may move along x
-    // and y. Where no cell matters it is the first one.
+    // and y. Where no cell matters it is the one below the centre, and the place below that.
     static CUDA_CALLABLE inline void sphere(const REAL* table, const REAL* asked, REAL* out)
     {
         const REAL *cells = table + 4ll * (int)asked[0], *size = asked + 4, bottom = asked[3] - asked[10];
@@ -78,6 +78,8 @@ TEXT = r"""
             const REAL x = asked[1 + f] * (1 / size[f]), most = asked[6 + f] - 1 + ring;
             at[f] = x > -ring ? (x < most ? x : most) : -ring;
             middle[f] = (int)(at[f] + ring + (REAL)0.5) - ring;
+            const int under = (int)(at[f] + ring) - ring, first = middle[f] - ring;
+            nearest = 2 * ring * nearest + (under - first < 2 * ring ? under - first : 2 * ring - 1);
         }
         REAL found = FAR;
         LOOP

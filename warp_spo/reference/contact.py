@@ -37,6 +37,7 @@ HOLD = 300.0  # resistance of a velocity limit, in inertias over the step
 MIDPOINT_PASSES = 4  # passes from which on a step uses the midpoint scheme
 ITERATIONS = 2  # of as many passes each
 AWAY = -1e3  # depth of a surface that is not there [m]
+FASTER, REACHES = 5.0, 2.0  # speed that a step may add to a shape's [m/s]; way per speed and step that is looked down
 PUSH_OUT = 1.0  # speed [m/s] at most at which a point that is slow comes out of the ground
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
 LENGTH, LEAST_LENGTH = 0.1, 3e-5  # of a body that cannot turn, or whose point cannot move; what is too short to be one
@@ -366,11 +367,11 @@ class ContactStep:
             up = np.array(ground.normal if plane else (0.0, 0.0, 1.0))
             if point.support is not None and not plane and point.support.kind not in ("corner", "hull corner"):
                 up = upward(ground, middle - moved, which)
-            grid = self._grid_touch(point, middle, moved, which)
+            grid = self._grid_touch(point, middle, moved, which, path)
             seat, hub, more = self._support_place(point, up, path) if grid is None else (grid[2], grid[2], 0.0)
             is_there = grid is not None or point.support is None or self._is_there(point, up)
             if point.support is not None and not plane and point.support.kind == "hull corner":
-                *place, is_there = self._field_row(point, middle, moved, which)
+                *place, is_there = self._field_row(point, middle, moved, which, path)
                 seat = hub = point.position + np.array(point.support.axes).T @ place
             at = (dense.body_matrix[point.body] @ homogeneous([*seat, 0, 0, 0, 1]))[:3, 3]
             bending = dense.jacobian_bias(path, [(point.body, (*hub, 0, 0, 0, 1))])[0, :3]
@@ -408,7 +409,7 @@ class ContactStep:
                 self.numbers.append(number)
         return Points(*(np.array(column) for column in zip(*rows, strict=True)))
 
-    def _grid_touch(self, point, middle, moved, which):
+    def _grid_touch(self, point, middle, moved, which, path):
         """Return normal, depth and place in the body of a point that touches a field's grid; None: of another one.
 
         ``middle``: of its shape. It is AWAY where the search found nothing.
@@ -419,19 +420,22 @@ class ContactStep:
         pose, start, cell = self.dense.body_matrix[point.body], np.array(ground.origin) + moved, np.array(ground.cells)
         axes, shape = np.array(support.axes) @ pose[:3, :3].T, support.kind.partition(" ")[0]
         heights = ground.heights.reshape(-1, *ground.heights.shape[-2:])
-        row = self._field_row(point, middle, moved, which)
+        row = self._field_row(point, middle, moved, which, path)
         found = touched(shape, heights[which], cell, middle - start, axes, support.sizes, point.radius, row)
         if found is None:
             return np.array([0.0, 0.0, 1.0]), AWAY, np.array(point.position)
         return *found[:2], pose[:3, :3].T @ (found[2] + start - pose[:3, 3])
 
-    def _field_row(self, point, middle, moved, which):
-        """Return the row that a search in the field finds for a point of a shape."""
+    def _field_row(self, point, middle, moved, which, path):
+        """Return the row that a search in the field finds for a point of a shape which moves along ``path``."""
         support, ground, turn = point.support, self.scene.ground, self.dense.body_matrix[point.body][:3, :3]
         shape = "corners" if support.kind == "hull corner" else support.kind.partition(" ")[0]
         heights = ground.heights.reshape(-1, *ground.heights.shape[-2:])
+        twist = self.dense.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0] @ path
+        speed = np.linalg.norm(twist[:3]) + np.linalg.norm(twist[3:]) * np.sum(support.sizes)
+        below = self.h * (REACHES * speed + FASTER)
         numbers = [which * heights[0].size, *(middle - ground.origin - moved), *(support.axes @ turn.T).ravel()]
-        numbers += [*support.sizes, *ground.cells, *heights[0].shape, np.sum(support.sizes), *support.table]
+        numbers += [*support.sizes, *ground.cells, *heights[0].shape, below, *support.table]
         return find(shape, heights.ravel(), numbers)[support.number]
 
     def _is_there(self, point, up):

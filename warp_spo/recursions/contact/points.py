@@ -34,7 +34,7 @@ from ...scene.ground import AWAY, HEIGHTS, PLACE, HeightField, Listed
 from ...scene.scene import Scene
 from ...scene.supports import CORNER, HULL_CORNER
 from ...trace.scalars import Entry, Value, absolute, branch, is_constant, less, lost, reciprocal, select
-from ...trace.spatial import IDENTITY, ZERO, Twist, Vector, cross, dot, total
+from ...trace.spatial import IDENTITY, ZERO, Twist, Vector, cross, dot, norm, total
 from ..kinematics import arm_on_link, carried_velocity, frame_on_link, zero
 from ..model import effective_mass
 from ..model.links import Link, Links
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 ARMS = 8  # spheres of a segment up to which their arms are kept, see docs/contact_measured.md
 STANDING = (0.0, 0.0, 1.0)  # normal of the ground in a body's frame for which weights of points that move are taken
 FASTER, REACHES = 5.0, 2.0  # speed that a step may add to a shape's [m/s]; way per speed and step that is looked down
-FAR = 1e30  # way down [m] that no field is below
+SEEN = 5.0  # radii below a sphere's centre within which gaps are those of the nearest point
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
 
 
@@ -160,19 +160,23 @@ def place_points(
     oriented: bool = False,
     branches: bool = False,
     gaps: bool = True,
+    ahead: Value | None = None,
     carry: Callable[[Link, ContactLinkMotion], ContactLinkMotion] | None = None,
 ) -> list[TracedContactPoint]:
     """Return the contact points that a trace works on, one for each surface that a point may touch.
 
     ``oriented``: with the inertial directions x, y, z in the axes of their links. ``branches``: code may leave out
-    points where their surface is not near. ``gaps``: of shapes over a field are also found where they do not close
-    within the step. ``carry``: returns what points and further links read of a link, on the way
+    points where their surface is not near. ``gaps``: of spheres over a field, to the nearest point up
+    to SEEN radii; beyond, to the place below. ``ahead``: the time
+    [s] within which shapes over a field have to come to touch its grid to be seen there, the step's if left out.
+    ``carry``: returns what points and further links read of a link, on the way
     to any point of the scene; None: what was computed.
     """
     scene = trace.links.scene
     ground, weights = scene.ground, inverse_weights(scene)
     assert ground is not None
     half_way, still = KICK in trace.inputs, (ZERO, ZERO)
+    ahead = joint_laws.h if ahead is None else ahead
     path = trace.vector(PATH) if half_way else qd
     place_of_ground = ground_offset(joint_laws)
     seats = {at: _contact_placement(trace, at, body, place) for at, body, place in _point_positions(trace, joint_laws)}
@@ -201,8 +205,7 @@ def place_points(
             assert isinstance(ground, HeightField) and point.support is not None
             if point.contact not in searches:
                 at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
-                size = total(_support_values(trace, number)[1])
-                below = size if gaps else joint_laws.h * _speed_bound(mine.travel, centre, size)
+                below = _way_down(mine.travel, centre, total(_support_values(trace, number)[1]), ahead)
                 shape = _shape_over(trace, number, ground, place_of_ground, at, toward, radius, below)
                 searches[point.contact] = shape, find(trace.graph, ground, place_of_ground, shape)
             shape, rows = searches[point.contact]
@@ -255,9 +258,9 @@ def place_points(
             touched = [grid.surface]
         elif rolls and isinstance(ground, HeightField):
             second = surface_count(ground, place_of_ground.varies, point.walls, rolls) == 2
-            cells, below = ring(ground, point.radius), FAR
-            if not gaps:
-                below = radius + joint_laws.h * _speed_bound(mine.travel, centre, radius)
+            cells, below = ring(ground, point.radius), radius + _way_down(mine.travel, centre, radius, ahead)
+            if gaps:
+                below = select(less(below, SEEN * radius), SEEN * radius, below)
             touched = sphere_surfaces(trace.graph, ground, at, place_of_ground, radius, cells, second, below)
         else:
             touched = surfaces(trace.graph, ground, at, place_of_ground, moves, point.walls)
@@ -363,14 +366,13 @@ def _shape_over(
     return Shape(support.kind, centre, turned, sizes, radius, below, support.table)
 
 
-def _speed_bound(twist: Twist, middle: Vector, size: Value) -> Value:
-    """Return a bound of how fast a shape and the ground may come closer in the step, times REACHES.
+def _way_down(twist: Twist, middle: Vector, size: Value, time: Value) -> Value:
+    """Return how far below a shape [m] the ground may be that it touches within a time [s].
 
     ``twist``: of its link. ``middle``: of the shape in the link. ``size``: how far the shape reaches from there [m].
     """
     w, v = twist
-    speed = total(absolute(x) for x in v + cross(w, middle)) + total(absolute(x) for x in w) * size
-    return REACHES * speed + FASTER
+    return time * (REACHES * (norm(v + cross(w, middle)) + norm(w) * size) + FASTER)
 
 
 def _place_support(trace: Trace, number: int, normal: Vector) -> SupportPlacement:

@@ -104,9 +104,8 @@ class ContactStepTrace(Step):
         forces = self._forces(points, states, alpha, excess)
         for number, surfaces in forces.items():
             self._report(number, surfaces)
-        phases.add_invariants(
-            item.value for item in self.finished.get("contact_gap", ())
-        )  # of the state before the step
+        before = self.finished.get("contact_gap", ())
+        phases.add_invariants(item.value for item in before)  # of the state before the step
         if status or "contact_excess" in self.reports:
             trace.graph.step = "excess|e"
             self.excess = [self._last(largest(values)) for values in (*excess[:2], efforts, excess[2])]
