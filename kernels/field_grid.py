@@ -113,6 +113,13 @@ GRID = r"""
             return at[0] < bottom && at[1] < bottom && at[2] < bottom && at[3] < bottom;
         }
 
+        // The highest corner of a cell.
+        CUDA_CALLABLE inline REAL top(int i, int j) const
+        {
+            const REAL* at = cells + 4ll * (i * count[1] + j);
+            return -least(least(-at[0], -at[1]), least(-at[2], -at[3]));
+        }
+
         // Whether all of the field under the shape is below the bottom; loads do not wait for each other.
         CUDA_CALLABLE inline bool is_far() const
         {

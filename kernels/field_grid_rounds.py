@@ -144,6 +144,10 @@ TEXT = r"""
             LOOP
             for (int j = low[1]; j <= high[1]; ++j) {
                 if (field.is_low(i, j)) continue;
+                if (!kind) { // no place of the cell is nearer to the axis than its top to the axis' lower end
+                    const REAL nearest = field.top(i, j) - (c[2] - on::absolute(axis[2]) * half);
+                    if (nearest + OUTWARD * half <= least(best.score[0], best.score[1]) + TIE) continue;
+                }
                 const REAL w[3] = {c[0] - i * field.cell[0], c[1] - j * field.cell[1], c[2] - field.height(i, j)};
                 if (on::absolute(w[0] * axis[1] - w[1] * axis[0]) > band) continue;
                 const REAL along = field.along(2, w[0], w[1], w[2]);

@@ -166,11 +166,10 @@ def place_points(
     """Return the contact points that a trace works on, one for each surface that a point may touch.
 
     ``oriented``: with the inertial directions x, y, z in the axes of their links. ``branches``: code may leave out
-    points where their surface is not near. ``gaps``: of spheres over a field, to the nearest point up
-    to SEEN radii; beyond, to the place below. ``ahead``: the time
-    [s] within which shapes over a field have to come to touch its grid to be seen there, the step's if left out.
-    ``carry``: returns what points and further links read of a link, on the way
-    to any point of the scene; None: what was computed.
+    points where their surface is not near. ``gaps``: of spheres over a field are distances to the nearest point up to
+    SEEN radii; beyond, they are vertical, as all are without it that the step cannot close. ``ahead``: the time [s]
+    within which shapes have to touch the grid of a field to be seen there; the step's if left out. ``carry``: returns
+    what points and further links read of a link, on the way to any point of the scene; None: what was computed.
     """
     scene = trace.links.scene
     ground, weights = scene.ground, inverse_weights(scene)
