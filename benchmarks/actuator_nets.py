@@ -2,20 +2,21 @@
 
     python -m benchmarks.actuator_nets [--worlds 4096] [--device cuda:0] [--json FILE]
 
-``servos``: the task as it is, whose step takes all substeps in one launch. ``split``: a network of one layer, which
-costs next to nothing, so that the difference is what launches of single substeps cost. ``network``: three layers of 32
-units for twelve joints, errors and rates now and two and four substeps ago. All are graphs of a whole step, replayed in
-turns. ``kernels``: the four launches of the network alone, by the threads of a block. The bound is that of float32
-products and sums: 2 x 2272 operations a joint and substep at 132 multiprocessors x 128 x 2 x 1.98 GHz.
+``servos``: the task as it is. ``network``: three layers of 32 units for twelve joints, errors and rates now and two and
+four substeps ago. The other rows are other ways to compute the same torques, see WAYS. All are graphs of a whole step,
+replayed in turns. The bound is that of float32 products and sums: 2 x 2272 operations a joint and substep at 132
+multiprocessors x 128 x 2 x 1.98 GHz.
 """
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import statistics
 import sys
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
@@ -24,13 +25,22 @@ from warp_spo.env import Env, actions, learning
 from warp_spo.env.actuator_nets import ActuatorNetwork
 from warp_spo.env.compile import actuator_launches
 from warp_spo.env.tasks import go2_flat
+from warp_spo.kernels import tensor_networks
 
 from . import command_line, env_times
 
 TURNS = 7
 PEAK = 132 * 128 * 2 * 1.98e3  # operations a microsecond
-BLOCKS = (64, 128, 256)
 STEPS = 100
+ALIKE = 20  # steps whose bits are compared
+WAYS: dict[str, dict[str, Any]] = {
+    "network": {},
+    "kernels apart": {"JOINED_ON": ()},
+    "products in float32": {"TENSOR_CORES": False},
+    "a joint at a time": {"TOGETHER": 1},
+    "a reciprocal each": {"PAIRS": False},
+}
+"""Constants of ``actuator_launches`` and ``tensor_networks``, by the name of a row."""
 MOST = 1.2  # times the step with servos
 SAME = 1e-6  # of the largest torque
 
@@ -58,9 +68,30 @@ def build(worlds: int, device: Any, net: ActuatorNetwork | None, **options: Any)
         go2_flat.make_env = held
 
 
-def compare(device: Any, net: ActuatorNetwork, worlds: int = 64) -> float:
-    """Return the largest error of torques through STEPS steps, as a share of the largest torque."""
-    env = build(worlds, device, net, graph=False)
+def build_way(worlds: int, device: Any, net: ActuatorNetwork, changes: dict[str, Any], **options: Any) -> Env:
+    """Return the task with a network and other constants."""
+    with contextlib.ExitStack() as held:
+        for name, value in changes.items():
+            module = tensor_networks if hasattr(tensor_networks, name) else actuator_launches
+            held.enter_context(mock.patch.object(module, name, value))
+        return build(worlds, device, net, **options)
+
+
+def bits(env: Env, worlds: int = 64) -> torch.Tensor:
+    """Return the states of the first ``worlds`` after ALIKE steps."""
+    generator = torch.Generator().manual_seed(2)
+    for _ in range(ALIKE):
+        given = torch.randn(worlds, 12, generator=generator)
+        env.step(torch.cat([given, torch.zeros(env.num_envs - worlds, 12)]).to(env.device))
+    return torch.cat([env.q, env.qd], dim=1)[:worlds].clone()
+
+
+def compare(device: Any, net: ActuatorNetwork, changes: dict[str, Any], worlds: int = 64) -> float:
+    """Return the largest error of torques through STEPS steps, as a share of the largest torque.
+
+    Kernels apart compute them, so that states before substeps can be read; :func:`main` compares its bits with others.
+    """
+    env = build_way(worlds, device, net, changes | {"JOINED_ON": ()}, graph=False)
     recorded: list[list[torch.Tensor]] = []
     step = env._step_dynamics
 
@@ -87,37 +118,42 @@ def compare(device: Any, net: ActuatorNetwork, worlds: int = 64) -> float:
     return worst / largest
 
 
+def show(found: dict[str, Any]) -> None:
+    """Print figures."""
+    for name, value in found.items():
+        unit = "" if isinstance(value, str) or "over" in name or "error" in name else " us"
+        print(f"{name:34} {value if isinstance(value, str) else f'{value:10.4g}'}{unit}", flush=True)
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = command_line.parser("actuator_nets", __doc__)
     parser.add_argument("--worlds", type=int, default=4096)
     options = parser.parse_args(arguments)
     device = learning.pick_device(options.device)
-    whole, tiny = network((6, 32, 32, 32, 1), (0, 2, 4)), network((2, 1), (0,))
-    error = compare(device, whole)
-    made = {name: build(options.worlds, device, net) for name, net in
-            (("servos", None), ("split", tiny), ("network", whole))}  # fmt: skip
+    whole = network((6, 32, 32, 32, 1), (0, 2, 4))
+    found: dict[str, Any] = {
+        "error of torques": compare(device, whole, {}),
+        "error of torques in float32": compare(device, whole, {"TENSOR_CORES": False}),
+    }
+    first = bits(build_way(64, device, whole, {}))
+    for name, worlds, changes in (("100 worlds", 100, {}), ("kernels apart", 64, WAYS["kernels apart"])):
+        found[f"bits: {name}"] = "equal" if bits(build_way(worlds, device, whole, changes)).equal(first) else "other"
+    show(found)
+    made = {"servos": build(options.worlds, device, None)}
+    made |= {name: build_way(options.worlds, device, whole, changes) for name, changes in WAYS.items()}
     for env in made.values():
         assert env_times.drive(env, env_times.DRIVEN), "observations that are not finite"
     turns = [{name: env_times.time_of(env.replay, device) for name, env in made.items()} for _ in range(TURNS)]
-    found: dict[str, Any] = {name: statistics.median(turn[name] for turn in turns) for name in made}
-    found["dynamics, servos"] = env_times.time_of(env_times.as_graph(made["servos"]._physics, device), device)
-    found["dynamics, network"] = env_times.time_of(env_times.as_graph(made["network"]._physics, device), device)
-    nets = made["network"]._networks
-    assert nets is not None
-    for block in BLOCKS:
-        actuator_launches.BLOCK = block
-        alone = env_times.as_graph(lambda: nets.run(lambda: None, made["network"]._stream), device)
-        found[f"kernels, blocks of {block}"] = statistics.median(env_times.time_of(alone, device) for _ in range(TURNS))
+    found |= {name: statistics.median(turn[name] for turn in turns) for name in made}
+    for name in ("servos", "network"):
+        found[f"dynamics, {name}"] = env_times.time_of(env_times.as_graph(made[name]._physics, device), device)
     products = sum(w.size for w in whole.weights)
     found["bound of the kernels"] = 4 * options.worlds * 12 * 2 * products / PEAK
-    found["network over servos"] = found["network"] / found["servos"]
-    found["split over servos"] = found["split"] / found["servos"]
-    found["error of torques"] = error
+    found |= {f"{name} over servos": found[name] / found["servos"] for name in WAYS}
     found["device"] = torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else "cpu"
-    for name, value in found.items():
-        unit = "" if isinstance(value, str) or "over" in name or "error" in name else " us"
-        print(f"{name:28} {value if isinstance(value, str) else f'{value:10.4g}'}{unit}", flush=True)
-    fine = error < SAME
+    show(found)
+    error = found["error of torques"]
+    fine = error < SAME and all(value == "equal" for name, value in found.items() if name.startswith("bits"))
     print(f"torques within {SAME:g}: {fine}; a step at most {MOST} times: {found['network over servos'] <= MOST}")
     if options.json:
         options.json.write_text(json.dumps(found, indent=1))

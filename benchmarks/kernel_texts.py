@@ -192,8 +192,6 @@ def calls(dyn: spo.Dynamics) -> Iterator[tuple[str, Callable[[], Any]]]:
 
 def _is_there(name: str, scene: spo.Scene) -> bool:
     """Return whether the scene has what a result of its contacts is about."""
-    if name == "contact_residual":
-        return bool(scene.contact_pairs)
     if name == "contact_moment":
         return any(scene.values[friction].any() for friction in TURNING_VALUES)
     return not name.startswith("contact_") or bool(scene.contacts)

@@ -1,25 +1,79 @@
-"""Times of an iteration of a training: without a page, with a page, and while a browser looks at it.
+"""By how much an iteration is longer with a page, while somebody looks at it, and with ``keep_failures``.
 
-    python -m benchmarks.watched_training --device cuda:0 --json watched.json
+    python -m benchmarks.watched_training --device cuda:0 --json watched.json       # ends after 2.5 minutes
 
-The three take turns on one environment; at most 0.5 % and 3 % are asked for.
+Four states take turns: a training as it is, one with ``--view`` at which nobody looks, one that a reader in another
+process looks at (see ``page_client``), and one whose environment keeps failures. A turn is some iterations; its ratio
+is that of its time to that of the first state in the same round, and the median over the rounds is compared with the
+limits: 0.5 %, 3 % and 2 %.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import json
 import statistics
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 from warp_spo.env import learning
 from warp_spo.env.state_copies import StateCopies
+from warp_spo.env.task_files import robot_file
 from warp_spo.env.tasks import task
+from warp_spo.env.training_log import LiveRows
+from warp_spo.viewing.appearance import file_appearance
 from warp_spo.viewing.training_view import TrainingView
 
-LIMITS = {"page": 0.005, "looked at": 0.03}  # by how much an iteration may be longer
+from .page_client import looking
+
+PLAIN, PAGE, WATCHED, KEPT = "plain", "page, nobody looks", "page, somebody looks", "keep_failures"
+LIMITS = {PAGE: 0.005, WATCHED: 0.03, KEPT: 0.02}  # by how much an iteration may be longer
+
+
+class Training:
+    """A training that goes on turn by turn.
+
+    Args:
+        chosen: the task. options: of the command. folder: of its rows. kept: further arguments of its environment.
+    """
+
+    def __init__(self, chosen: Any, options: argparse.Namespace, folder: Path, **kept: Any):
+        self.env = chosen.build(options.worlds, options.device, seed=0, **kept)
+        self.runner, _ = learning.prepare(
+            self.env, chosen.LEARNER, folder, 10**6, save_interval=10**6, every=10**6, loggers=()
+        )
+        self.runner.save_all = lambda *_: None  # each turn would end with a checkpoint
+        self.file, self.rows = robot_file(chosen), folder / "progress.jsonl"
+
+    def learn(self, iterations: int) -> float:
+        """Learn for so many iterations; return the time of one [s]."""
+        self.wait()
+        began = time.perf_counter()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.runner.learn(iterations)
+        self.wait()
+        return (time.perf_counter() - began) / iterations
+
+    def wait(self) -> None:
+        """Wait for the device."""
+        self.env.q.sum().item()
+
+    @contextlib.contextmanager
+    def page(self, copies: StateCopies) -> Any:
+        """Show the training as ``train --view`` does, inside; a context manager."""
+        look = None if self.file is None else file_appearance(self.file, self.env.scene)
+        view = TrainingView(self.env.scene, copies, LiveRows(self.rows), self.env.default_q, appearance=look)
+        self.runner.watchers.append(copies.copy)
+        view.start()
+        try:
+            yield view.page
+        finally:
+            self.runner.watchers.remove(copies.copy)
+            view.close()
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -29,42 +83,49 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--worlds", type=int, default=4096)
     parser.add_argument("--device", default="cuda:0")
     parser.add_argument("--iterations", type=int, default=20, help="of a turn")
-    parser.add_argument("--turns", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=15, help="at most")
+    parser.add_argument("--seconds", type=float, default=150.0, help="after which no round begins")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
-    chosen = task(options.task)
-    env = chosen.build(options.worlds, options.device, seed=0)
-    copies = StateCopies(env)
-    total = options.iterations * (3 * options.turns + 1)
-    with tempfile.TemporaryDirectory() as folder:
-        runner, _ = learning.prepare(env, chosen.LEARNER, folder, total, save_interval=10**6, loggers=())
-        runner.watchers.append(copies.copy)
-        times: dict[str, list[float]] = {"none": [], "page": [], "looked at": []}
-        runner.learn(options.iterations)  # compiles and warms up
-        for _ in range(options.turns):
-            for state, rows in times.items():
-                view = None
-                if state != "none":
-                    view = TrainingView(env.scene, copies, lambda: [], env.default_q)
-                    if state == "looked at":
-                        view.page.record()  # as a browser that looks
-                    view.start()
-                    time.sleep(1.0)
-                began = time.perf_counter()
-                runner.learn(options.iterations)
-                env.q.sum().item()  # waits for the device
-                rows.append((time.perf_counter() - began) / options.iterations)
-                if view is not None:
-                    view.page._recorded = None
-                    view.close()
-    medians = {state: statistics.median(rows) for state, rows in times.items()}
-    more = {state: medians[state] / medians["none"] - 1.0 for state in LIMITS}
-    for state, seconds in medians.items():
-        print(f"{state:10} {1e3 * seconds:8.2f} ms an iteration {100 * more.get(state, 0.0):+6.2f} %")
-    print(f"copies: {copies.count}")
+    began, chosen = time.monotonic(), task(options.task)
+    times: dict[str, list[float]] = {PLAIN: [], PAGE: [], WATCHED: [], KEPT: []}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        plain = Training(chosen, options, folder / "plain")
+        kept = Training(chosen, options, folder / "kept", keep_failures=folder / "failures")
+        print(kept.env._failures.describe(), flush=True)
+        copies = StateCopies(plain.env)
+        for each in (plain, kept):
+            each.learn(options.iterations)  # compiles and warms up
+        print(f"begins after {time.monotonic() - began:.0f} s", flush=True)
+        for number in range(options.rounds):
+            if number and time.monotonic() - began > options.seconds:
+                break
+            times[PLAIN].append(plain.learn(options.iterations))
+            with plain.page(copies) as page:
+                before = copies.count
+                times[PAGE].append(plain.learn(options.iterations))
+                assert copies.count == before, "states were copied while nobody looked"
+                with looking(page):
+                    times[WATCHED].append(plain.learn(options.iterations))
+            times[KEPT].append(kept.learn(options.iterations))
+        files = len(kept.env.failure_files())
+    ratios = {
+        state: [row / base - 1.0 for row, base in zip(times[state], times[PLAIN], strict=True)] for state in LIMITS
+    }
+    longer = {state: statistics.median(rows) for state, rows in ratios.items()}
+    for state, rows in times.items():
+        words = ""
+        if state in longer:
+            low, high = (100 * edge(ratios[state]) for edge in (min, max))
+            words = f"{100 * longer[state]:+6.2f} % ({low:+.2f} to {high:+.2f}; limit {100 * LIMITS[state]} %)"
+        print(f"{state:22} {1e3 * statistics.median(rows):8.2f} ms an iteration {words}")
+    print(f"{len(times[PLAIN])} rounds of {options.iterations} iterations, {copies.count} copies, {files} failures")
     if options.json:
-        options.json.write_text(json.dumps({"seconds": medians, "longer": more, "worlds": options.worlds}, indent=1))
-    return int(any(more[state] > limit for state, limit in LIMITS.items()))
+        row = {"task": options.task, "worlds": options.worlds, "device": options.device, "seconds": times,
+               "longer": longer, "copies": copies.count, "ring_bytes": kept.env._failures.bytes}  # fmt: skip
+        options.json.write_text(json.dumps(row, indent=1) + "\n")
+    return int(any(longer[state] > limit for state, limit in LIMITS.items()))
 
 
 if __name__ == "__main__":

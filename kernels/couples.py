@@ -17,14 +17,14 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from . import coupling_points, pass_loops
+from . import couple_laws, pass_loops
 from . import hull_distance as hulls
 from . import narrow_phase as touches
-from .coupling import FEW, VALUES, entries, table
 from .elementary import C_TYPE
-from .narrow_phase import AWAY, HEADER, POINT
+from .narrow_phase import AWAY, POINT
 
 FIELDS, EXCESS, LAST, PLACES, MOST_WARPS = 5, 3, 27, 24, 4  # the first ones as in warp_spo.recursions.contact.coupled
+FEW, VALUES = 2, 3  # pairs whose lists take no memory; values of a pair: stiffness, damping, friction
 
 
 class Couples(NamedTuple):
@@ -34,7 +34,7 @@ class Couples(NamedTuple):
         pairs: those of each couple. signs: of each pair, 1 where its first body is on the couple's link f, else
             -1. points, eps, weight: of each pair: points at most, speed below which friction is a damper, inverse
             weight that predicts slip.
-        solids: their shapes, with ``lists`` and ``reals``. looks: points are found however far shapes are apart.
+        solids: their shapes, with ``kinds`` and ``reals``. looks: points are found however far shapes are apart.
         reports: what the points do after the last pass is asked for.
     """
 
@@ -61,7 +61,7 @@ def declare(couples: Couples, T: type, shared: bool = False) -> str:
     balls = [sum(x * x for x in half[3 * i : 3 * i + 3]) ** 0.5 + radius[i] for i in range(2 * pairs)]
     lists = {
         "first_pair": first_pair, "pair": [pair for each in couples.pairs for pair in each], "points": couples.points,
-        "first_point": first_point[:-1], "entry": entries(couples.points)[:-1],
+        "first_point": first_point[:-1],
     } | couples.solids.kinds  # fmt: skip
     reals = {"eps": couples.eps, "weight": couples.weight, "sign": couples.signs, "half": half, "radius": radius}
     reals["ball"] = balls
@@ -69,14 +69,11 @@ def declare(couples: Couples, T: type, shared: bool = False) -> str:
     tables = [table("int", f"{name}_of", [str(x) for x in row], few) for name, row in lists.items()]
     tables += [table(c, f"{name}_of", [f"{x!r}{number}" for x in row], few) for name, row in reals.items()]
     sizes = {
-        "PAIRS": pairs, "COUPLES": count, "HEADER": HEADER, "POINT": POINT, "LAST": LAST, "FIELDS": FIELDS,
+        "PAIRS": pairs, "COUPLES": count, "POINT": POINT, "LAST": LAST, "FIELDS": FIELDS,
         "PLACES": PLACES, "EXCESS": EXCESS, "LOOKS": int(couples.looks), "REPORTS": int(couples.reports),
     }  # fmt: skip
-    shapes = coupling_points.NATIVE[: coupling_points.NATIVE.index("    // Finds the points of a pair")]
-    laws = coupling_points.NATIVE[coupling_points.NATIVE.index("    // Begins the damper of a point") :]
-    text = NATIVE.replace("SHAPES", shapes.strip()).replace("LAWS", laws.strip())
     text = (
-        hulls.lines(text, bool(couples.solids.hulls))
+        hulls.lines(NATIVE.replace("LAWS", couple_laws.NATIVE), bool(couples.solids.hulls))
         .replace("REAL", c)
         .replace("FUSED", f"FUSED_{c}")
         .replace("TABLES", "\n    ".join(tables))
@@ -85,12 +82,21 @@ def declare(couples: Couples, T: type, shared: bool = False) -> str:
     for word, pragma in (("UNROLL", "#pragma unroll"), ("LOOP", "#pragma unroll 1")):
         text = text.replace(f"{word}\n", f"{pragma}\n")
     constants = ", ".join(f"{name} = {value}" for name, value in sizes.items())
-    own = {"across": first_point[-1], "touch": entries(couples.points)[-1], "bound": 2 * pairs}
+    own = {"across": first_point[-1], "touch": POINT * first_point[-1], "bound": 2 * pairs}
     arrays = [f"{c} couple_{name}_row[{count}] = {{}};" for name, count in own.items()]
     arrays += [f"int couple_{name}_row[{pairs}] = {{}};" for name in ("count", "closed", "candidate")]
     column = SHARED if shared else "typedef REAL* Column;"
     solids = touches.native(T, *couples.solids.met)
     return "\n".join([column.replace("REAL", c), solids, text.replace("CONSTANTS", constants), *arrays])
+
+
+def table(c: str, name: str, row: list[str], few: bool) -> str:
+    """Return a function that gives an entry of a list; of a short list without memory, so that a compiler folds it."""
+    if few:
+        body = "".join(f"i == {i} ? {x} : " for i, x in enumerate(row[:-1])) + row[-1]
+        return f"static CUDA_CALLABLE inline {c} {name}(int i) {{ return {body}; }}"
+    listed = ", ".join(row)
+    return f"static CUDA_CALLABLE inline {c} {name}(int i) {{ static const {c} all[] = {{{listed}}}; return all[i]; }}"
 
 
 def arrays(couples: Couples) -> dict[str, int]:
@@ -157,8 +163,6 @@ struct couples
     enum { FIRST, BETWEEN, CLOSING, AT_LAST };
     TABLES
 
-    SHAPES
-
     LAWS
 
     static CUDA_CALLABLE APART int find(int pair, Column places, REAL* touches)
@@ -179,7 +183,7 @@ struct couples
             both[side].box = box_of(which);
             HULLS both[side].hull = hull_of(which);
         }
-        return solids::touch(both[0], both[1], touches + entry_of(pair) + HEADER, 1, points_of(pair));
+        return solids::touch(both[0], both[1], touches + POINT * first_point_of(pair), 1, points_of(pair));
     }
 
     // Most that the shapes can be in each other, and how far from the origin a point of one of them can be.
@@ -305,7 +309,6 @@ struct couples
         Column dampers, Column coupled, Column report)
     {
         if (stage == AT_LAST && !REPORTS) return;
-        const Pair origin = {{{0, 0, 0}, {0, 0, 0}}, {0, 0}, 0};
         LOOP
         for (int p = warp; p < COUPLES; p += warps) {
             REAL twist[6], K[LAST], excess[3] = {0, 0, 0};
@@ -345,10 +348,10 @@ struct couples
                 int shut_points = closed[pair], near_points = candidate[pair];
                 LOOP
                 for (int i = 0; i < count; ++i) {
-                    Touch touch(touches, 1, pair, i);
+                    Touch touch(touches, pair, i);
                     UNROLL
                     for (int c = 0; c < 3; ++c) normal[c] = touch.normal[c] = touch.normal[c] * sign_of(pair);
-                    const REAL speed = rate(twist, origin, touch, v, slip);
+                    const REAL speed = rate(twist, touch, v, slip);
                     const int at = first_point_of(pair) + i;
                     const REAL before = across[at];
                     REAL a = before;

@@ -3,7 +3,9 @@
 It continues the text of :mod:`.joint_points`.
 """
 
-NATIVE = r"""
+AFTER_A_PASS = "    // -- after a pass\n"
+"""Line of PASSES where the unknown of a pass, its laws and its factors are known."""
+PASSES = r"""
 LOOP
 for (int number = 0;; ++number) {
     const bool first = number == 0, last = number == pass_count - 1 && pass_count >= 3, done = number == pass_count;
@@ -346,8 +348,10 @@ for (int number = 0;; ++number) {
         SYNC
     }
     SYNC
+    // -- after a pass
 }
-// -- results
+"""
+RESULTS = r"""// -- results
 SYNC
 REAL *const excesses = s + AT_A;
 int wrong = floored;  // 1: a result is no number, or rounding is more than a pivot; 2: an input is none
@@ -441,7 +445,8 @@ if (alive) {
         status.data[world] = all_wrong & 2 ? NOT_FINITE : all_wrong ? PIVOT : crowded ? CROWDED : beyond ? CONTACT : 0;
     }
 }
-#undef LANES
+"""
+END = r"""#undef LANES
 #undef SYNC
 #undef ANY
 #undef EACH

@@ -140,6 +140,14 @@ def solver(sizes: Sizes, T: type, lanes: int = 32, registers: int | None = None,
 
     It launches ``lanes * worlds`` threads on CUDA, ``worlds`` on the CPU, in blocks of BLOCK.
     """
+    passes = joint_passes.PASSES.replace(joint_passes.AFTER_A_PASS, "")
+    text = native_text(passes + joint_passes.RESULTS + joint_passes.END, sizes, T, lanes, refine)
+    shared = world_bytes(sizes, T) * (BLOCK // lanes)
+    return native.kernel("joint_space", text, ARGUMENTS, T, registers=registers, shared=shared)
+
+
+def native_text(text: str, sizes: Sizes, T: type, lanes: int, refine: int) -> str:
+    """Return the native text of a kernel that goes on with ``text`` where points have slots and Jacobians."""
     starts, size = shared_layout(sizes, T)
     constants = {
         "DOFS": sizes.dofs, "N": 2 * sizes.tiles, "NB": sizes.tiles, "NNZ": sizes.entries, "PAIRS": sizes.pairs,
@@ -152,7 +160,7 @@ def solver(sizes: Sizes, T: type, lanes: int = 32, registers: int | None = None,
     constants |= {f"C_{name.upper()}": i for i, name in enumerate(DOF_VALUES)}
     constants |= {f"P_{name.upper()}": i for i, name in enumerate(PAIR_VALUES)}
     c = C_TYPE[T]
-    text = (joint_points.FUNCTIONS + joint_points.POINTS + joint_passes.NATIVE).replace(
+    text = (joint_points.FUNCTIONS + joint_points.POINTS + text).replace(
         "CONSTANTS", ", ".join(f"{name} = {x}" for name, x in constants.items())
     )
     text = text.replace("UNROLL\n", "#pragma unroll\n").replace("LOOP\n", "#pragma unroll 1\n")
@@ -164,5 +172,4 @@ def solver(sizes: Sizes, T: type, lanes: int = 32, registers: int | None = None,
         .replace("REAL", c)
         .replace("FMA(", f"FUSED_{c}(")
     )
-    text = text.replace("INVERSE_ROOT(", "rsqrtf(" if T is wp.float32 else "rsqrt(")
-    return native.kernel("joint_space", FUSED + text, ARGUMENTS, T, registers=registers, shared=size * (BLOCK // lanes))
+    return FUSED + text.replace("INVERSE_ROOT(", "rsqrtf(" if T is wp.float32 else "rsqrt(")

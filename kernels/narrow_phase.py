@@ -14,7 +14,7 @@ from . import hull_distance as hulls
 from . import segment_convex as sticks
 from .elementary import C_TYPE
 
-HEADER, POINT, AWAY = 3, 7, -1e3
+POINT, AWAY = 7, -1e3
 MOST = 8  # points of two boxes
 LEAD = 0.05  # share of the smallest half size by which the second box must be farther away to give the common face
 

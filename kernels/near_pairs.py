@@ -247,7 +247,8 @@ if (convex::passes_by(shape[0], shape[1], tables, at[0], turn[0], at[1], turn[1]
 """Text of the narrow phase, and of the kernel that follows it: what they do first, between, and last in PAIR."""
 
 
-def _text(body: str, pairs: int, near: int, T: type) -> str:
+def text_of(body: str, pairs: int, near: int, T: type) -> str:
+    """Return the native text ``body`` with the sizes of a scene, for scalars of type ``T``."""
     sizes = {
         "PAIRS": pairs, "NEAR": near, "SIDE": len(SIDE), "ARM": SIDE.index("arm"), "BOX": SIDE.index("size_x"),
         "COM": SIDE.index("com_x"),
@@ -264,7 +265,7 @@ def broad(pairs: int, near: int, T: type) -> wp.Kernel:
     arrays = [
         ("poses", 3), ("velocities", 3), ("place", 1), ("sides", 1), ("slack", 0), ("h", 0), ("near", 1),
     ]  # fmt: skip
-    return native.kernel("broad_phase", _text(BROAD, pairs, near, T), arrays, T)
+    return native.kernel("broad_phase", text_of(BROAD, pairs, near, T), arrays, T)
 
 
 ARRAYS = [
@@ -281,19 +282,20 @@ def narrow(pairs: int, near: int, T: type, routines: tuple[str, ...]) -> wp.Kern
 
     ``routines``: of :data:`.convex_pairs.ROUTINES` those that the pairs need. Shapes are as there.
     """
-    text = convex_pairs.definition(T, routines) + _pair_text(NARROW, pairs, near, T)
+    text = convex_pairs.definition(T, routines) + pair_text(NARROW, pairs, near, T)
     return native.kernel("narrow_phase", text, ARRAYS, T)
 
 
 @functools.cache
 def passing(pairs: int, near: int, T: type, routines: tuple[str, ...]) -> wp.Kernel:
     """Take away the points of pairs that pass beside each other; arguments and threads of :func:`narrow`."""
-    text = convex_pairs.definition(T, routines, passing=True) + _pair_text(PASSING, pairs, near, T)
+    text = convex_pairs.definition(T, routines, passing=True) + pair_text(PASSING, pairs, near, T)
     return native.kernel("passing_pairs", text, ARRAYS, T)
 
 
-def _pair_text(parts: dict[str, str], pairs: int, near: int, T: type) -> str:
+def pair_text(parts: dict[str, str], pairs: int, near: int, T: type) -> str:
+    """Return the native text of a thread that takes a near pair; ``parts``: by name, what takes their place in PAIR."""
     text = PAIR
     for name, part in parts.items():
         text = text.replace(f"\n{name}\n", f"\n{part.strip()}\n" if part else "\n")
-    return _text(text, pairs, near, T)
+    return text_of(text, pairs, near, T)

@@ -25,11 +25,19 @@ from .shared_rows import (
     source,
     wait_where_used,
 )
-from .substeps import STATE, hold_state, move_state, repeat_on_cuda, repeat_substeps, replace_state, write_state
+from .substeps import (
+    STATE,
+    Before,
+    hold_state,
+    move_state,
+    repeat_on_cuda,
+    repeat_substeps,
+    replace_state,
+    write_state,
+)
 
 # shared memory that a block may declare: 48 KiB less the share that Warp uses; more is asked for at the launch
 SHARED_BYTES = 46 * 1024
-COUPLED_BYTES = 220 * 1024  # of a block whose segments couple pairs of bodies: all that a multiprocessor has
 WIDE_BYTES = 110 * 1024  # shared memory of a block with long rows, of which two fit into an H100's 228 KiB
 IN_PLACE, STAGED, MAPPED, RELAYED, TILED, DIRECT = "in place", "staged", "mapped", "relayed", "tiled", "direct"
 BY_TABLE = (MAPPED, RELAYED)  # the ways in which a table says which value each entry of a row receives
@@ -86,6 +94,7 @@ class KernelLayout(NamedTuple):
         repeats: the statements are those of a substep, see :mod:`.substeps`.
         spill_slots: the number of values that a thread sets aside in shared memory, as ``ASIDE(i)``.
         near: names and entries of tables that a team copies to shared memory, as ``near_NAME[i]``: loops wait for them.
+        before: code that runs before each substep.
     """
 
     rows: list[SharedRow]
@@ -105,6 +114,7 @@ class KernelLayout(NamedTuple):
     repeats: bool = False
     spill_slots: int = 0
     near: tuple[tuple[str, int], ...] = ()
+    before: tuple[Before, ...] = ()
 
     @property
     def state(self) -> list[SharedRow]:
@@ -114,7 +124,10 @@ class KernelLayout(NamedTuple):
     @property
     def shared_rows(self) -> list[SharedRow]:
         """The rows that are in shared memory."""
-        return self.rows if self.staged else self.state if self.warps > 1 else []
+        if self.staged:
+            return self.rows
+        written = [row for row in self.rows if row.name == "tau"] if self.before else []
+        return (self.state if self.warps > 1 else []) + written
 
     @property
     def groups(self) -> int:
@@ -128,6 +141,7 @@ class KernelLayout(NamedTuple):
         rows += sum(pitch(row.entries) for row in self.staged_further if self.replaced(row) is None)
         rows += pitch(self.result.array.entries) if self.result.way == STAGED else 0
         scalars = WARP_SIZE * (rows + self.messages + self.warps * self.spill_slots + sum(map(len, self.cached)))
+        scalars += max((each.scalars(self.warps) for each in self.before), default=0)
         if self.result.way == RELAYED:
             return max(scalars, self.result.slot_layout.scalars)
         return scalars + (self.result.slot_layout.scalars if self.result.way == MAPPED else 0)
@@ -177,6 +191,7 @@ class _Places:
         rows: of rows and further results in shared memory, by name.
         result: of the result, and its width for a world; 0, 0 where substeps write the state.
         messages: of what warps send each other. spill_slots: of what threads set aside.
+        before: of what code before substeps uses.
     """
 
     def __init__(self, layout: KernelLayout):
@@ -199,6 +214,7 @@ class _Places:
             at += WARP_SIZE * width if result.way in (STAGED, MAPPED) else 0
         self.messages = at
         self.spill_slots = at + WARP_SIZE * layout.messages
+        self.before = self.spill_slots + WARP_SIZE * layout.warps * layout.spill_slots
 
 
 def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
@@ -206,6 +222,7 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
     c = C_TYPE[T]
     numbers = [f"const {c} {name}_row[1] = {{{name}}};" for name in layout.numbers]
     found = field_grid.definitions(cpu, T) + hull_corners.definitions(cpu, T)
+    found += dict.fromkeys(text for each in layout.before for text in each.define)
     text = [NATIVE[c], *found, *numbers, "#if defined(__CUDA_ARCH__)", *_cuda_text(layout, cuda, T)]
     text += ["#else", *_cpu_text(layout, cpu, c), "#endif", "#undef SENT", "#undef RELAY"]
     return "\n".join([*text, *(["#undef FIELD"] if layout.fields else []), ""])
@@ -214,6 +231,10 @@ def assemble(layout: KernelLayout, cuda: str, cpu: str, T: type) -> str:
 def _cuda_text(layout: KernelLayout, statements: str, T: type) -> list[str]:
     """Return the code of a thread on CUDA around its statements."""
     c, places, team = C_TYPE[T], _Places(layout), WARP_SIZE * layout.warps
+    if layout.before:
+        own = f"constexpr int warps = {layout.warps}; {c}* own = stage + {places.before};"
+        ends = [f"{each.cuda}\n{_barrier(layout)}" for each in layout.before]
+        statements = "\n".join(["{", own, *ends, "}", statements])
     copied, statements = _copy_in(layout, places, statements, c)
     if layout.retries:
         statements = (
@@ -369,6 +390,7 @@ def _cpu_text(layout: KernelLayout, statements: str, c: str) -> list[str]:
     if layout.messages:
         text += [f"{c} sent[{layout.messages}];", "#define SENT(i) sent[i]"]
     text += define_fields(layout.fields, c, layout.cached)
+    statements = "\n".join([*(each.cpu for each in layout.before), statements])
     text += [repeat_substeps(statements) if layout.repeats else statements]
     if result.way in BY_TABLE:
         text += [f"result_row[{result.slots}] = 0;", f"{c}* own = out.data + world * {out.entries};"]

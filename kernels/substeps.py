@@ -4,6 +4,9 @@ On CUDA the state of a world is in shared memory while the loop runs, or in the 
 the CPU it is in the rows of the result. All other rows stay as they are, and are read again.
 """
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 from .shared_rows import SharedRow
 
 SUBSTEPS = "substeps"  # the name of the number of substeps
@@ -11,6 +14,23 @@ SUBSTEPS = "substeps"  # the name of the number of substeps
 FENCE = 'asm volatile("" ::: "memory");'
 SYNC = "__syncthreads();"
 STATE = {"q": "q_out", "qd": "out"}  # the rows of the state, and the results that take their place
+
+
+class Before(NamedTuple):
+    """Code that writes ``tau_row`` before each substep.
+
+    On CUDA a row of tau is in shared memory, and all threads of a team that has ``warps`` run the code: 32 worlds, of
+    which ``lane`` has the one of the thread, ``world``. On the CPU the row is that of the caller's array.
+
+    Attributes:
+        define: texts of structures that the code uses. cuda, cpu: the code.
+        scalars: ``scalars(warps)``, of shared memory that it uses, from ``own`` on, and for which it leaves nothing.
+    """
+
+    define: tuple[str, ...]
+    cuda: str
+    cpu: str
+    scalars: Callable[[int], int]
 
 
 def repeat_substeps(statements: str) -> str:

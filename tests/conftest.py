@@ -1,3 +1,4 @@
+import gc
 import os
 import socket
 import sys
@@ -34,6 +35,7 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    gc.set_threshold(50_000, 10, 50)  # of the many small objects of traces; by default a quarter of the time goes there
     if config.getoption("--device") == "cpu":
         os.environ.setdefault("JAX_PLATFORMS", "cpu")
     asked = config.getoption("--granularity")
@@ -63,6 +65,17 @@ def without_optimization(make):
         return kernel
 
     return make_unoptimized
+
+
+def pytest_collection_finish(session):
+    """On the CPU Newton's kernels, which are no part of what is tested, are compiled without optimization.
+
+    Those of its kinematics alone would take nine seconds.
+    """
+    if not wp.is_cuda_available() and not session.config.getoption("--optimized"):
+        for name, module in list(sys.modules.items()):
+            if name.startswith("newton."):
+                wp.set_module_options({"optimization_level": 0}, module)
 
 
 @pytest.fixture(scope="session")

@@ -64,5 +64,8 @@ def test_what_no_step_takes_is_refused_with_the_way_out():
             two.with_contacts([spo.Contact(0, other=box, **shape)])
     turning = two.with_contacts([spo.Contact(0, other=box, **can), spo.Contact(1, sphere=0.1, torsional_friction=0.01)])
     dyn = spo.Dynamics(turning)
-    with pytest.raises(spo.UnsupportedError, match=r"cylinders and ellipsoids .*torsional friction.*give capsules"):
+    with pytest.raises(
+        spo.UnsupportedError,
+        match=r"scene with torsional friction .*; set contact_torsional_friction to zero.*capsules",
+    ):
         dyn.step(two.neutral_q[None], np.zeros((1, 12)), None, DT)

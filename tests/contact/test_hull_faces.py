@@ -108,9 +108,8 @@ def stones_states(seed, worlds):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("granularity", ["tree", "segment"])
-def test_a_step_of_stones_is_the_dense_one(device, granularity):
-    dyn = spo.Dynamics(stones(), 6, device=device, dtype="float64", granularity=granularity)
+def test_a_step_of_stones_is_the_dense_one(device):
+    dyn = spo.Dynamics(stones(), 6, device=device, dtype="float64")
     found = assert_is_dense(dyn, *stones_states(0, 6), least=12)
     assert (found["contact_f"] != 0.0).any(axis=(0, 2)).all()
 
@@ -123,7 +122,7 @@ def test_float32_of_stones_loses_two_digits_at_most(device):
     """
     q, qd = stones_states(0, 256)
     exact, found = (
-        stepped(spo.Dynamics(stones(), 256, device=device, dtype=dtype, granularity="tree"), q, qd)["qd"]
+        stepped(spo.Dynamics(stones(), 256, device=device, dtype=dtype), q, qd)["qd"]
         for dtype in ("float64", "float32")
     )
     off = np.abs(found - exact).max(axis=1) / np.abs(exact).max(axis=1)

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 import warp_spo as spo
 from support.hull_scenes import CAN, CUBE, LAW, TETRAHEDRON
 from support.pair_scenes import WEDGE, cube, free, stepped
-from support.pair_steps import assert_is_dense, respond_by_whole_trees
+from support.pair_steps import assert_is_dense
 from support.pair_touches import hull_of, planted, touches_found
 from warp_spo.kernels import hull_distance
 from warp_spo.reference import body_contact
@@ -293,22 +293,14 @@ def rocks_states(seed, worlds):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("granularity", ["tree", "segment"])
-def test_a_step_with_hulls_is_the_dense_one(device, granularity):
+def test_a_step_with_hulls_is_the_dense_one(device):
     """Hulls on either side, one that stands still; a world does alone what it does among others."""
     (q, qd), scene = rocks_states(0, 6), rocks()
-    dyn = spo.Dynamics(scene, 6, device=device, dtype="float64", granularity=granularity)
+    dyn = spo.Dynamics(scene, 6, device=device, dtype="float64")
     found = assert_is_dense(dyn, q, qd, least=12)
     assert (found["contact_f"][:, len(scene.contact_points) :] != 0.0).any(axis=(0, 2)).all()
     for alone in (0, 5):
-        dyn = spo.Dynamics(scene, 1, device=device, dtype="float64", granularity=granularity)
+        dyn = spo.Dynamics(scene, 1, device=device, dtype="float64")
         one = stepped(dyn, q[alone : alone + 1], qd[alone : alone + 1])
         for key in ("q", "qd", "contact_f"):
             np.testing.assert_array_equal(one[key][0], found[key][alone])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_the_response_of_whole_trees_takes_hulls(monkeypatch, device, dtype):
-    respond_by_whole_trees(monkeypatch)
-    assert_is_dense(spo.Dynamics(rocks(), 6, device=device, dtype=dtype), *rocks_states(1, 6), least=12)

@@ -391,6 +391,34 @@ def test_a_fast_ball_is_not_missed(device, speed):
     assert abs(v) < speed
 
 
+def crowd(*more, masses=(1.0,) * 7):
+    """Seven balls each of which may touch each, too many for generated code, and ``more`` contacts."""
+    balls = [spo.Contact(j, sphere=0.1, other=spo.Contact(i, sphere=0.1)) for j in range(7) for i in range(j)]
+    bodies = [spo.Body(mass, inertia=0.01 * mass * np.eye(3)) for mass in masses]
+    return free(bodies, [*more, *balls])
+
+
+REFUSED = {
+    "torsional friction": (
+        lambda: crowd(spo.Contact(0, sphere=0.1, torsional_friction=0.1)), "set contact_torsional_friction to zero"),
+    "dofs without inertia": (lambda: crowd(masses=(1.0,) * 6 + (0.0,)), "give their bodies mass"),
+    "boxes without thickness": (
+        lambda: crowd(spo.Contact(0, box=(0.1, 0.1, 0.0), other=box(1, 0.1))), "give boxes half sizes above zero"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("lacks", REFUSED)
+def test_pairs_that_no_step_takes_are_refused_with_a_way_out(lacks):
+    make, way = REFUSED[lacks]
+    scene = make()
+    dyn, q = spo.Dynamics(scene, 2, "cpu"), np.tile(scene.neutral_q, (2, 1))
+    assert f"no step takes pairs of bodies beside {lacks}" in dyn.explain()
+    with pytest.raises(
+        spo.UnsupportedError, match=f"contact between bodies in a scene with {lacks} .*; {way}.*; or list few"
+    ):
+        dyn.step(q, np.zeros((2, scene.dof_count)), dt=H)
+
+
 def test_what_it_does_not_take_has_words():
     """And such scenes keep generated code."""
     scene = grasp.scene()

@@ -6,10 +6,9 @@ import pytest
 import warp_spo as spo
 from support.pair_motions import largest_rise, momentum, stand
 from support.pair_scenes import H, cube, cubes_in_a_row, free, stack, stacked, stepped
-from support.pair_steps import leave_to_generated_code
 from warp_spo.examples import grasp
-from warp_spo.kernels import coupling, straight_line
-from warp_spo.recursions.contact import coupled, pair_pieces
+from warp_spo.kernels import straight_line
+from warp_spo.recursions.contact import coupled
 from warp_spo.reference.body_contact import PairStep
 
 
@@ -111,25 +110,16 @@ def test_a_heavy_cube_on_light_ones(device):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("together", [True, False])
-def test_more_pairs_than_are_solved_together(monkeypatch, device, together):
-    """Aggregates solve all; otherwise eight are exact, ten as near as the residual says. Momentum is kept."""
-    for module in (coupled, pair_pieces):
-        monkeypatch.setattr(module, "is_supported", lambda links: together)
-    leave_to_generated_code(monkeypatch)
-    for count, pairs in ((9, 8), (11, 10)):
-        scene, q, qd = cubes_in_a_row(count)
-        dyn, residual = spo.Dynamics(scene, 2, device=device, dtype="float64"), np.full(2, np.nan)
-        found = stepped(dyn, q, qd, contact_residual=residual)
-        for w in range(2):
-            _, wanted = PairStep(scene, q[w], qd[w], H).run(passes=4)
-            most, error = np.abs(wanted.f).max(), np.abs(found["qd"][w] - wanted.v).max()
-            if together or pairs <= coupling.EXACT:
-                assert residual[w] == 0.0 and error < 1e-10
-            else:
-                assert 0.0 < residual[w] < 1e-5 * most and error < 1e-5  # 8e-6 N and 2e-6 m/s
-        before, after = momentum(scene, q, qd), momentum(scene, found["q"], found["qd"])
-        np.testing.assert_allclose(after[:, :3], before[:, :3], atol=1e-12)
+def test_a_row_of_cubes(monkeypatch, device):
+    """Ten pairs in a row are solved together. Momentum is kept."""
+    monkeypatch.setattr(coupled, "is_supported", lambda links: True)
+    scene, q, qd = cubes_in_a_row(11)
+    found = stepped(spo.Dynamics(scene, 2, device=device, dtype="float64"), q, qd)
+    for w in range(2):
+        _, wanted = PairStep(scene, q[w], qd[w], H).run(passes=4)
+        assert np.abs(found["qd"][w] - wanted.v).max() < 1e-10
+    before, after = momentum(scene, q, qd), momentum(scene, found["q"], found["qd"])
+    np.testing.assert_allclose(after[:, :3], before[:, :3], atol=1e-12)
 
 
 def legs(contacts=True):

@@ -14,7 +14,6 @@ from support.pair_scenes import (
     box,
     cube,
     cube_thrown_at_cube,
-    cubes_in_a_row,
     free,
     hand,
     hand_states,
@@ -28,14 +27,14 @@ from support.pair_scenes import (
     stack,
     stepped,
 )
-from support.pair_steps import assert_is_dense, plant, respond_by_whole_trees
+from support.pair_steps import assert_is_dense, plant
 from support.pair_touches import assert_points_are_those_of_the_reference
 from warp_spo.dynamics.stepping.integrators import CONTACT_STEP, PAIRED_STEP
 from warp_spo.examples import grasp
 from warp_spo.execution import plan
 from warp_spo.execution.device_facts import MEASURED
-from warp_spo.kernels import couples, coupling_blocks, coupling_points, coupling_shared
-from warp_spo.recursions.contact import aggregates, coupled, pair_pieces
+from warp_spo.kernels import couple_laws, couples
+from warp_spo.recursions.contact import aggregates, coupled
 
 WORLDS = 9
 KINDS = [(0, 0), (0, 1), (1, 0), (1, 1), (0, 2), (2, 0)]
@@ -61,36 +60,24 @@ def test_a_step_is_the_dense_one(device):
         assert_is_dense(dyn, q, qd, passes, least=WORLDS, contact_friction=friction)
 
 
-def test_a_hand_is_the_dense_one(device, granularity=None):
+def test_a_hand_is_the_dense_one(device):
     """Limbs on a base, four pairs of which are of the same two bodies, and a world in which nothing touches."""
     q, qd = hand_states(0, 6)
-    dyn = spo.Dynamics(hand(), 6, device=device, dtype="float64", granularity=granularity)
+    dyn = spo.Dynamics(hand(), 6, device=device, dtype="float64")
     assert_is_dense(dyn, q, qd, least=12)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["hand", "mixed"])
-def test_limbs_do_what_one_thread_does(device, name):
-    """And a world does the same alone as among others, whose bodies may touch where its own do not."""
+def test_a_world_does_the_same_alone(device, name):
+    """As among others, whose bodies may touch where its own do not; and whatever granularity is asked for."""
     scene, states = {"hand": (hand, hand_states), "mixed": (mixed, mixed_states)}[name]
-    (q, qd), found = states(1, 6), {}
-    for granularity in ("tree", "segment"):
-        dyn = spo.Dynamics(scene(), 6, device=device, dtype="float64", granularity=granularity)
-        found[granularity] = assert_is_dense(dyn, q, qd)
-        alone = spo.Dynamics(scene(), 1, device=device, dtype="float64", granularity=granularity)
-        one = stepped(alone, q[-1:], qd[-1:])
-        for key in ("q", "qd", "contact_f"):
-            np.testing.assert_array_equal(one[key][0], found[granularity][key][-1])
-    np.testing.assert_allclose(found["segment"]["qd"], found["tree"]["qd"], atol=1e-11 * np.abs(qd).max())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["hand", "mixed"])
-def test_the_response_of_whole_trees_does_the_same(monkeypatch, device, name):
-    """Scenes take it whose links share dofs, or whose aggregates would be too long, and whose limbs cannot share."""
-    respond_by_whole_trees(monkeypatch)
-    scene, states = {"hand": (hand, hand_states), "mixed": (mixed, mixed_states)}[name]
-    assert_is_dense(spo.Dynamics(scene(), 6, device=device, dtype="float64"), *states(1, 6))
+    q, qd = states(1, 6)
+    found = assert_is_dense(spo.Dynamics(scene(), 6, device=device, dtype="float64"), q, qd)
+    alone = spo.Dynamics(scene(), 1, device=device, dtype="float64", granularity="segment")
+    one = stepped(alone, q[-1:], qd[-1:])
+    for key in ("q", "qd", "contact_f"):
+        np.testing.assert_array_equal(one[key][0], found[key][-1])
 
 
 @pytest.mark.slow
@@ -100,12 +87,11 @@ def test_a_ring_of_bodies_between_arms(device):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("granularity", ["tree", "segment"])
-def test_shapes_that_stand_still(device, granularity):
+def test_shapes_that_stand_still(device):
     """Of the inertial frame, as of a body that is fixed there."""
     (q, qd), found = shelf_states(0, 5), {}
     for body in (-1, 2):
-        dyn = spo.Dynamics(shelf(body), 5, device=device, dtype="float64", granularity=granularity)
+        dyn = spo.Dynamics(shelf(body), 5, device=device, dtype="float64")
         found[body] = assert_is_dense(dyn, q, qd, least=5)
     assert found[-1]["contact_f"][:, 4:].any(axis=(0, 2)).tolist() == [True, True, False, True]
     for name in ("q", "qd", "contact_f", "contact_slip"):
@@ -144,8 +130,8 @@ def test_nan_stays_in_its_world(device):
 
 FIND = "counts[pair] = find(pair, places, touches);"
 BUGS = {
-    "adhesion": (coupling_points, "touch.depth - h * normal > 0;", "true;"),
-    "opens at last": (coupling_points, "(closing && closed) || ", ""),
+    "adhesion": (couple_laws, "touch.depth - h * normal > 0;", "true;"),
+    "opens at last": (couple_laws, "(closing && closed) || ", ""),
     "no friction": (couples, "sides.add(a, touch.at);", ""),
     "no lever of friction": (couples, "skew[3 * i + j - 3]", "0"),
     "no lever of springs": (couples, "add_cross(load, push + 1, normal);", ""),
@@ -156,24 +142,15 @@ BUGS = {
     "the base has no part": (aggregates.Node.close, "P.less(U[at], G[-1])", "P"),
     "the base stands still": (aggregates.Node.open, "x - dot(self.G[-1 - at], alpha) if self.G else x", "x"),
 }
-BUGS_OF_LIMBS = {
-    "unequal forces": (coupling_shared, "side ? -at(s, from", "side ? (REAL)(-0.9) * at(s, from"),
-    "no lever": (coupling_shared, "add_cross(f + 3, arm, f);", ""),
-    "no other pair": (coupling_blocks, "limb_of(a) != limb_of(b)", "p != q"),
-    "no friction": (coupling_points, "K[r * (r + 1) / 2 + r] += a;", ""),
-    "a pair of two is forgotten": (coupling_shared, "if (touch.missing()) break;", "if (a > first_pair_of(p)) break;"),
-    "the base has no part": (coupling_blocks, "at(s, AT_BASE + i) = h * inertia[i]", "at(s, AT_BASE + i) = 0"),
-    "the base stands still": (coupling_blocks, "alpha[j] = h * at(s, ALPHA + j)", "alpha[j] = 0"),
-}
 
 
 TELLING = [0, 1, 20, 71, 112, 194]
 """Throws in which points open and close between passes: found as those whose step a planted bug changes."""
 
 
-def test_a_cube_that_is_thrown_at_another(device, granularity=None):
+def test_a_cube_that_is_thrown_at_another(device):
     scene, q, qd = cube_thrown_at_cube(TELLING)
-    dyn = spo.Dynamics(scene, len(q), device=device, dtype="float64", granularity=granularity)
+    dyn = spo.Dynamics(scene, len(q), device=device, dtype="float64")
     assert_is_dense(dyn, q, qd, 3)
 
 
@@ -182,17 +159,8 @@ def test_a_cube_that_is_thrown_at_another(device, granularity=None):
 def test_a_planted_bug_is_seen(monkeypatch, device, bug):
     plant(monkeypatch, *BUGS[bug])
     with pytest.raises(AssertionError):
-        test_a_cube_that_is_thrown_at_another(device, "tree")
-        test_a_hand_is_the_dense_one(device, "tree")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("bug", BUGS_OF_LIMBS)
-def test_a_bug_of_limbs_is_seen(monkeypatch, device, bug):
-    plant(monkeypatch, *BUGS_OF_LIMBS[bug])
-    with pytest.raises(AssertionError):
-        test_a_cube_that_is_thrown_at_another(device, "segment")
-        test_a_hand_is_the_dense_one("cpu", "segment")  # a GPU has no room for its limbs in float64
+        test_a_cube_that_is_thrown_at_another(device)
+        test_a_hand_is_the_dense_one(device)
 
 
 STICK = dict(capsule=((0, 0, 0), (0, 0, 1), 0.1))
@@ -225,7 +193,7 @@ def test_a_body_with_modes_is_refused_on_either_side():
 
 
 def test_the_plan_takes_the_form_that_was_faster():
-    """A thread a world for arms and for many worlds, limbs for cubes that are alike; see the measured facts."""
+    """A thread a world for pairs, and for arms; limbs for cubes on the ground; see the measured facts."""
     forms = {}
     for name, scene in (("arm", grasp.scene()), ("stack", stack())):
         for worlds in (4096, 65536):
@@ -236,7 +204,7 @@ def test_the_plan_takes_the_form_that_was_faster():
     held = plan.choose(arm, 256, MEASURED, "float32")
     assert held.granularity == "tree" and "most of its links are on one path" in held.reason
     assert plan.choose(stack(), 256, MEASURED, "float32").granularity == "segment"
-    assert forms["stack", 4096] == ["segment", "segment"] and forms["stack", 65536] == ["tree", "segment"]
+    assert forms["stack", 4096] == forms["stack", 65536] == ["tree", "segment"]
 
 
 def test_couples_have_warps_of_their_own_where_worlds_are_few(monkeypatch):
@@ -260,22 +228,13 @@ def test_couples_have_warps_of_their_own_where_worlds_are_few(monkeypatch):
 def test_calls_without_a_kernel_have_names(device):
     scene = stack((1.0, 1.0))
     q, qd = scene.neutral_q[None].astype(np.float32), np.zeros((1, 12), np.float32)
-    many, states, rates = cubes_in_a_row(11)
-    with pytest.raises(spo.UnsupportedError, match="granularity='segment' where pairs of bodies are not all on limbs"):
-        spo.Dynamics(many, 2, device=device, granularity="segment").step(
-            *np.float32([states]), *np.float32([rates]), None, H
-        )
     still = spo.Contact(2, sphere=0.1, other=spo.Contact(-1, sphere=0.1))  # neither of the two can move
     fixed = shelf(2).with_contacts([*shelf(2).contacts, still])
-    assert pair_pieces.by_limbs(shelf(2)) and not pair_pieces.by_limbs(fixed)
     at = shelf_states(0, 2)[0]  # such a pair is solved in joint space, whatever the granularity
     found = [spo.Dynamics(one, 2, device=device, dtype="float64", granularity=forced)
              .step(at, np.zeros_like(at[:, 2:]), None, H)[1]
              for one, forced in ((fixed, "segment"), (fixed, "tree"))]  # fmt: skip
     np.testing.assert_array_equal(*found)
-    alone = spo.Dynamics(scene.with_contacts(scene.contacts[:1]), device=device)
-    with pytest.raises(ValueError, match="contact_residual is given, and no bodies of the scene touch each other"):
-        alone.step(q, qd, None, H, report=spo.StepReport(contact_residual=np.zeros(1, np.float32)))
     assert "1 pairs of bodies" in spo.Dynamics(scene, device=device).explain()
     torch = pytest.importorskip("torch")
     with pytest.raises(ValueError, match="contact between bodies"):

@@ -8,8 +8,11 @@ import torch
 
 import warp_spo as spo
 from support.env_scenes import FEET, walker_q, walker_scene
+from support.host_lanes import run_network
 from warp_spo.env import Env, actions, events, observations, rewards
 from warp_spo.env.actuator_nets import ActuatorNetwork
+from warp_spo.env.compile import actuator_launches, tensor_weights
+from warp_spo.kernels import tensor_networks
 
 JOINTS = 8
 SAME = 1e-6  # of the largest torque: float32, sums of 32 terms
@@ -28,7 +31,13 @@ def saved(net, path):
     return path
 
 
-def walker(network, worlds=4, **changes):
+def network_of(*sizes, activation="softsign", **more):
+    rng = np.random.default_rng(3)
+    weights = [rng.normal(size=(o, i)) / np.sqrt(i) for i, o in itertools.pairwise(sizes)]
+    return ActuatorNetwork(weights, [rng.normal(size=len(w)) for w in weights], activation, **more)
+
+
+def walker(network, worlds=4, device="cpu", **changes):
     """Return a walker whose joints have learned actuators and no servos."""
     scene = walker_scene(delay=0)
     options = {
@@ -41,12 +50,12 @@ def walker(network, worlds=4, **changes):
         "decimation": 4,
         "events": [events.joints((-0.2, 0.2), (-1.0, 1.0))],
     }
-    return Env(scene, worlds, "cpu", **(options | changes))
+    return Env(scene, worlds, device, **(options | changes))
 
 
 @pytest.mark.parametrize("order", ["pos_vel", "vel_pos"])
-def test_torques_are_those_of_torch_through_100_steps(order, tmp_path):
-    """400 substeps, four ends of episodes: states are those before each substep, histories and torques torch's own."""
+def test_torques_are_those_of_torch_through_30_steps(order, tmp_path):
+    """120 substeps, an end of episodes: states are those before each substep, histories and torques torch's own."""
     net = module()
     network = ActuatorNetwork.from_torchscript(
         saved(net, tmp_path / "net.pt"), input_idx=(0, 2, 5), input_order=order, pos_scale=2.0, vel_scale=0.1,
@@ -62,7 +71,7 @@ def test_torques_are_those_of_torch_through_100_steps(order, tmp_path):
     env._step_dynamics = record
     past, largest, worst = [], 0.0, 0.0
     generator = torch.Generator().manual_seed(1)
-    for _ in range(100):
+    for _ in range(30):
         given = torch.randn(4, JOINTS, generator=generator)
         recorded.clear()
         done = env.step(given)[2]
@@ -99,6 +108,53 @@ def test_activations(name, tmp_path):
     with torch.no_grad():
         inputs = torch.stack([error, rate], dim=-1)
         assert torch.allclose(5.0 * net(inputs)[..., 0].double(), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "activation", "lags", "joints"),
+    [
+        ((6, 32, 32, 32, 1), "softsign", (0, 2, 4), 3),
+        ((10, 20, 64, 1), "tanh", range(5), 2),
+        ((2, 16, 1), "tanh", (0,), 1),
+    ],
+)
+def test_products_of_tensor_cores_are_as_accurate_as_float32(sizes, activation, lags, joints, tmp_path):
+    """The text of a GPU's kernel, run by 32 threads of the host, beside torch in float64."""
+    network = network_of(*sizes, activation=activation, input_idx=lags)
+    shape = tensor_weights.shape_of(network)
+    given = np.random.default_rng(4).normal(size=(joints, 32, sizes[0])).astype(np.float32)
+    staged = np.zeros((joints, shape.staged // tensor_networks.PITCH, tensor_networks.PITCH), np.float32)
+    staged[:, : sizes[0], :32] = given.transpose(0, 2, 1)
+    definition = tensor_networks.define("network", shape, joints)
+    found = run_network(definition, tensor_weights.pack(network, shape), staged, tmp_path)
+    expected = network._evaluate(torch.tensor(given).double())[..., 0].numpy()
+    assert np.abs(found - expected).max() < SAME * np.abs(expected).max()
+
+
+def test_what_tensor_cores_do_not_evaluate():
+    for network in (
+        network_of(2, 16, 1, activation="relu", input_idx=(0,)),  # its outputs have no bound
+        network_of(2, 65, 1, input_idx=(0,)),
+        network_of(2, 1, input_idx=(0,)),
+    ):
+        assert tensor_weights.shape_of(network) is None
+
+
+def test_the_kernel_of_the_step_has_the_bits_of_kernels_apart(monkeypatch, device):
+    """Two networks, histories, starts anew, limits, mean forces; other worlds beside change nothing."""
+    first, other = network_of(4, 16, 1, input_idx=(0, 2), torque_scale=9.0), network_of(2, 8, 1, input_idx=(3,))
+    acts = [actions.ActuatorNet(first, "joint_[1-6]"), actions.ActuatorNet(other, "joint_[78]")]
+    seen = {"actor": [observations.joint_position(), lambda w: w.joint_force, lambda w: w.contact_force[:, 2]]}
+    found = {}
+    for name, kinds, worlds in (("apart", (), 40), ("joined", ("cpu", "cuda"), 40), ("more", ("cpu", "cuda"), 70)):
+        monkeypatch.setattr(actuator_launches, "JOINED_ON", kinds)
+        env = walker(None, worlds, str(device), actions=acts, observations=seen, granularity="segment")
+        assert (env._networks is None) == (name != "apart")
+        generator = torch.Generator().manual_seed(1)
+        given = [torch.randn(70, JOINTS, generator=generator)[:worlds].to(env.device) for _ in range(30)]
+        found[name] = torch.stack([torch.cat([env.step(x)[0]["actor"], env.q, env.qd], dim=1)[:40] for x in given])
+    assert torch.equal(found["apart"], found["joined"]) and torch.equal(found["joined"], found["more"])
+    assert torch.isfinite(found["apart"]).all() and found["apart"].abs().max() > 1.0
 
 
 def test_limits_and_means_of_contact_forces():

@@ -91,9 +91,10 @@ def far(one, other, before):
     return float((one - other).norm() / (one - before).norm())
 
 
-@pytest.mark.parametrize("normalize", [True, False])
-@pytest.mark.parametrize("options", [{}, {"schedule": "fixed", "normalize_advantage_per_mini_batch": True},
-                                     {"use_clipped_value_loss": False, "optimizer": "adamw"}])  # fmt: skip
+@pytest.mark.parametrize(("options", "normalize"), [
+    ({}, True), ({"schedule": "fixed", "normalize_advantage_per_mini_batch": True}, False),
+    ({"use_clipped_value_loss": False, "optimizer": "adamw"}, True),
+])  # fmt: skip
 def test_updates_equal_those_of_rsl_rl(options, normalize):
     """Of episodes that end by their length and by a fall, so that values at time-outs count."""
     learner = dataclasses.replace(LEARNER, normalize=normalize)

@@ -81,6 +81,21 @@ def test_a_slider_steers_the_followed_world_or_all(env, page):
     assert env.memory("command held").all()
 
 
+def test_sliders_show_the_command_until_they_are_moved(env, page):
+    env.command[1:3, 0] = torch.tensor([0.5, -0.25])
+    env.memory("command held").zero_()
+    slider = page.sliders["command 0"]
+    for world, wanted in ((1, 0.5), (2, -0.25)):
+        page.numbers["followed"].value = world
+        page.tick(0.0)
+        assert slider.value == pytest.approx(wanted, abs=slider.step) and env.command[world, 0] == wanted
+    slider.value = 0.75
+    page.tick(0.0)
+    assert env.command[2, 0] == 0.75 and env.memory("command held")[2, 0] == 1.0
+    page.free()
+    assert not env.memory("command held").any()
+
+
 def test_a_push_gives_the_impulse(env, page):
     """Mass times the jump of the velocities is the impulse on the cart, and none on the pole's joint."""
     page.pause()

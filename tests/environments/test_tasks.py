@@ -184,7 +184,7 @@ def test_a_checkpoint_with_other_things_in_it_is_refused(trained, tmp_path, part
 def test_play_draws_a_film(trained, tmp_path):
     from PIL import Image
 
-    given = ["cartpole", str(trained / "model_2.pt"), "--seconds", "0.6"]
+    given = ["cartpole", str(trained / "model_2.pt"), "--seconds", "0.3"]
     given += ["--out", str(tmp_path / "film")]
     assert play.main(given) == 0
     with Image.open(tmp_path / "film.gif") as film_, Image.open(tmp_path / "film.png") as strip:

@@ -349,10 +349,10 @@ def test_pairs_that_no_step_takes_are_left_out_of_true_and_refused_of_all():
     ):
         scene = spo.from_mujoco(model, contacts=True)
     assert not scene.contact_pairs and len(scene.contact_points) == 44
-    with pytest.raises(spo.UnsupportedError, match=rf"contact of 946 pairs of shapes, more than 32 \({why}\)"):
+    with pytest.raises(spo.UnsupportedError, match=rf"contact of 946 pairs of shapes \({why}\)"):
         quiet(spo.from_mujoco, model, contacts="ground", pairs="all")
     cans = crowd(44, 3, 'type="cylinder" size=".1 .1"')
-    with pytest.raises(spo.UnsupportedError, match=rf"contact of 1 pairs of .*cylinders or ellipsoids \({why}\)"):
+    with pytest.raises(spo.UnsupportedError, match=rf"contact of 1 pairs of shapes \({why}\)"):
         quiet(spo.from_mujoco, cans, contacts="ground", pairs=[("g0", "g1")])
     scene = spo.from_mujoco(crowd(9, 3), contacts=True)
     assert (len(scene.contact_pairs), len(scene.contact_points)) == (36, 9)

@@ -199,3 +199,44 @@ def test_wrong_arguments():
         spo.from_mujoco(mujoco.MjSpec())
     with pytest.raises(ValueError, match="from_mujoco: the model has no bodies"):
         spo.from_mujoco(compiled("<mujoco/>"))
+
+
+def test_parts_without_names_take_none_that_another_has():
+    """Keyframes, bodies, joints, actuators and equalities: MuJoCo's model has as many, and its names stay theirs."""
+    link = '<body{}><joint{} axis="0 1 0"/><geom size=".1" pos=".2 0 0"/>{}</body>'
+    bodies = link.format("", "", link.format(' name="body_0"', ' name="body_0_joint"', ""))
+    bodies += link.format(' name="a"', "", link.format(' name="a:k"', "", ""))
+    bodies += link.format(' name="b"', ' name="b_joint_2"/><joint name="b_joint_1"/><joint', "")
+    ties = '<weld body1="body_0" body2="a"/><weld name="equality_0" body1="a:k" body2="b"/>'
+    model = compiled(
+        f"<mujoco><worldbody>{bodies}</worldbody><equality>{ties}</equality><actuator>"
+        '<motor joint="body_0_joint" ctrlrange="0 1"/><motor name="actuator_0" joint="body_0_joint"/></actuator>'
+        '<keyframe><key name="key_1" qpos="1 0 0 0 0 0 0" ctrl="0 3"/><key qpos="2 0 0 0 0 0 0"/></keyframe></mujoco>'
+    )
+    scene = spo.from_mujoco(model)
+    assert len(scene.keyframes) == model.nkey
+    assert scene.keyframes["key_1"].ctrl.tolist() == model.key("key_1").ctrl.tolist() == [0, 3]
+    loops, motors = [loop.label for loop in scene.loops], [one.label for one in scene.actuators]
+    for labels in (scene.body_labels, scene.joint_labels, loops, motors):
+        assert len(set(labels)) == len(labels), labels
+    for name in ("body_0", "a:k"):
+        np.testing.assert_allclose(scene.bodies[scene.body_labels.index(name)].mass, model.body(name).mass)
+        assert scene.body_labels.index(name) == model.body(name).id - 1
+    for name in ("body_0_joint", "b_joint_2", "b_joint_1"):
+        carrier = model.body(model.jnt_bodyid[model.joint(name).id]).id - 1
+        hinge = scene.hinges[scene.joint_labels.index(name)]
+        while hinge.child != carrier:  # through bodies without mass
+            hinge = next(other for other in scene.hinges if other.parent == hinge.child)
+    assert scene.actuators[1].label == "actuator_0" and scene.actuators[0].ctrl_range[1] == 1
+    by_hand = spo.Scene(
+        [spo.Body(1.0, label="body_1"), spo.Body(2.0)],
+        [spo.Hinge("revolute", -1, 0, axis=(0, 0, 1), label="joint_1"), spo.Hinge("revolute", 0, 1, axis=(0, 0, 1))],
+    )
+    assert by_hand.body_labels == ["body_1", "body_1_2"] and by_hand.joint_labels == ["joint_1", "joint_1_2"]
+
+
+def test_an_uneven_actuatorfrcrange_without_an_actuator_is_named():
+    """It bounds nothing in MuJoCo; an even one is an effort limit of the scene."""
+    joint = '<joint name="a" actuatorfrcrange="-1 2"/><geom size=".1"/>'
+    with pytest.warns(UserWarning, match="left out: the uneven actuatorfrcrange of joint 'a', which has no actuator;"):
+        spo.from_mujoco(compiled(f"<mujoco><worldbody><body>{joint}</body></worldbody></mujoco>"))

@@ -178,6 +178,34 @@ def test_warnings_of_the_loader_and_values_stand_in_the_text(tmp_path):
         page.close()
 
 
+def test_meshes_of_packages_are_drawn_and_a_fixed_robot_stands_on_the_ground(tmp_path):
+    """A URDF names its package in two ways and one mesh that is nowhere; its leg hangs 2 m below its fixed root."""
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "leg.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 -1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+    )
+    body = '<inertial><mass value="2"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    mesh = '<{}><geometry><mesh filename="package://{}" scale="2 2 2"/></geometry></{}>'
+    shapes = [("visual", "/meshes/leg.obj"), ("collision", "meshes/leg.obj"), ("visual", "meshes/lost.stl")]
+    file = tmp_path / "leg.urdf"
+    file.write_text(
+        f'<robot name="r"><link name="hip">{body}</link><link name="leg">{body}'
+        + "".join(mesh.format(tag, name, tag) for tag, name in shapes)
+        + '</link><joint name="turn" type="continuous"><parent link="hip"/><child link="leg"/><axis xyz="0 0 1"/>'
+        "</joint></robot>"
+    )
+    page = view(file, port=18080)
+    try:
+        (leg,) = page.layers["what the file draws"].handles
+        assert leg[0] == page.scene.body_labels.index("r/leg") and np.allclose(leg[1].vertices.min(axis=0), [0, 0, -2])
+        assert any("lost.stl" in note for note in page.notes)
+        assert page.scene.ground.height == pytest.approx(-2.0)
+        points = [point.position[2] for point in page.scene.contact_points]
+        assert min(points) == pytest.approx(-2.0)
+    finally:
+        page.close()
+
+
 def test_a_scene_by_hand_with_a_loop_stays_closed():
     """The slider of a four-bar linkage moves all of it; the loop is closed to a micrometre."""
     from warp_spo.examples import fourbar

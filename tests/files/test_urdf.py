@@ -1,5 +1,6 @@
 """URDF: what is read is what Pinocchio reads, to rounding; all else is an error that names file, line and element."""
 
+import importlib.util
 import re
 import warnings
 
@@ -340,7 +341,10 @@ def test_a_spherical_joint_has_damping(tmp_path):
 
 @pytest.mark.filterwarnings("ignore::newton.NewtonWarning")
 def test_inertias_are_replaced_by_newtons_rule(rng):
-    """Symmetric matrices of all kinds; Newton computes in float32, where the least moment is a share of 1e-6."""
+    """Symmetric matrices of all kinds; Newton computes in float32, where the least moment is a share of 1e-6.
+
+    Its constants are moments of inertia; here they shrink with a body whose moments are all below 1e-3 kg m^2.
+    """
     newton = pytest.importorskip("newton")
     turns = np.linalg.qr(rng.normal(size=(200, 3, 3)))[0]
     moments = rng.normal(0.3, 0.4, (200, 3)) * 10.0 ** rng.integers(-4, 2, (200, 1))
@@ -354,8 +358,50 @@ def test_inertias_are_replaced_by_newtons_rule(rng):
     ours = [repaired(float(mass), inertia) for mass, inertia in zip(masses, inertias, strict=True)]
     np.testing.assert_array_equal(model.body_mass.numpy(), [mass for mass, _ in ours])
     assert sum(not np.array_equal(new, old) for (_, new), old in zip(ours, inertias, strict=True)) > 100
-    for (_, mine), theirs in zip(ours, model.body_inertia.numpy(), strict=True):
-        np.testing.assert_allclose(mine, theirs, atol=2e-6 * np.abs(theirs).max(initial=1e-3))
+    for (_, mine), theirs, given in zip(ours, model.body_inertia.numpy(), moments, strict=True):
+        if not 0.0 < given.max() < 1e-3:
+            np.testing.assert_allclose(mine, theirs, atol=2e-6 * np.abs(theirs).max(initial=1e-3))
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-2, 1e-3, 1e-4])
+def test_small_bodies_keep_their_inertia(size, tmp_path):
+    """A box of 1 x 2 x 3 sizes at 1000 kg/m^3 has moments m (a^2 + b^2) / 12, in URDF and by density in USD."""
+    sides = size * np.array([1.0, 2.0, 3.0])
+    mass = float(1000.0 * sides.prod())
+    moments = mass / 12.0 * (np.sum(sides**2) - sides**2)
+    entries = " ".join(f'i{a}{a}="{moment!r}"' for a, moment in zip("xyz", moments.tolist(), strict=True))
+    inertial = f'<inertial><mass value="{mass!r}"/><inertia {entries} ixy="0" ixz="0" iyz="0"/></inertial>'
+    links = f'<link name="a"/><link name="b">{inertial}</link>'
+    cube = """#usda 1.0
+(metersPerUnit = 1
+ upAxis = "Z")
+def Xform "b" (prepend apiSchemas = ["PhysicsRigidBodyAPI"]) {
+    def Cube "box" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {
+        double size = SIZE
+        double3 xformOp:scale = (1, 2, 3)
+        uniform token[] xformOpOrder = ["xformOp:scale"]
+    }
+}"""
+    usd = tmp_path / "b.usda"
+    usd.write_text(cube.replace("SIZE", repr(size)))
+    files = [written(tmp_path, robot(links, JOINT.format("j", "continuous", "a", "b", ""))), usd]
+    for file in files if importlib.util.find_spec("pxr") else files[:1]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            scene = load(file)
+        np.testing.assert_allclose(scene.values["body_mass"][0, -1], mass, rtol=1e-6)
+        np.testing.assert_allclose(scene.values["body_inertia"][0, -1], np.diag(moments), rtol=1e-5, atol=0)
+
+
+def test_small_bodies_are_repaired_in_proportion():
+    """What no body can have is replaced at every size, by the same share of the largest moment."""
+    for moments in ([-1.0, 2.0, 2.0], [1.0, 1.0, 4.0], [0.0, 1.0, 1.0]):
+        for scale in (1e-4, 1e-8, 1e-12):
+            _, inertia = repaired(scale, scale * np.diag(moments))
+            _, same = repaired(1.0, 1e-4 * np.diag(moments))
+            np.testing.assert_allclose(inertia / scale, same / 1e-4, rtol=1e-9)
+            low, middle, high = np.linalg.eigvalsh(inertia)
+            assert low > 0.0 and low + middle >= high
 
 
 COLLADA = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">

@@ -277,6 +277,38 @@ def test_what_a_scene_does_not_have_is_named(name, tmp_path):
     assert re.fullmatch(rf"load: '.*robot\.usda': left out: {name} \(/[^()]*\)", warning), warning
 
 
+BALL = (
+    'def Sphere "ball" (prepend apiSchemas = ["PhysicsCollisionAPI"])\n{\n' + "double radius.timeSamples = {0: 2}\n}\n"
+)
+MOVED = body("arm").replace("xformOp:translate =", "xformOp:translate.timeSamples = {0: (0, 0, 1), 1:").replace(
+    '\n        uniform token[]', '}\n        uniform token[]')  # fmt: skip
+ONLY_AT_TIMES = {
+    "physics:mass": swing().replace("physics:mass = 2.0", "physics:mass.timeSamples = {0: 2}"),
+    "physics:lowerLimit": swing("float physics:lowerLimit.timeSamples = {0: -10}"),
+    "drive:angular:physics:stiffness": swing(
+        "float drive:angular:physics:stiffness.timeSamples = {0: 5}", apis=("PhysicsDriveAPI:angular",)
+    ),
+    "physics:gravityMagnitude": swing(
+        head=HEAD.replace("physics:gravityMagnitude = 10", "physics:gravityMagnitude.timeSamples = {0: 3}")
+    ),
+    "xformOp:translate": stage(MOVED, joint("j", None, "arm")),
+    "radius": swing(body_more=BALL),
+}
+
+
+@pytest.mark.filterwarnings("ignore:load. replaced the mass")
+@pytest.mark.parametrize("name", ONLY_AT_TIMES)
+def test_values_at_times_alone_are_named(name, tmp_path):
+    """The schema's own value, which counts then, hides none; a value beside those at times counts."""
+    (tmp_path / "robot.usda").write_text(ONLY_AT_TIMES[name])
+    with pytest.warns(UserWarning, match=rf"left out: {name} \(/[^()]*\)$"):
+        spo.load(tmp_path / "robot.usda")
+    scene, warning = loaded(
+        tmp_path, swing("float physics:upperLimit.timeSamples = {0: 5}\nfloat physics:upperLimit = 40")
+    )
+    assert only(scene, "joint_limit_upper") == pytest.approx(40 * DEGREE, rel=SINGLE) and not warning
+
+
 def test_what_says_nothing_is_not_named(tmp_path):
     """Values that are the schema's own, zeros of vendors, and settings of solvers."""
     silent = """

@@ -26,6 +26,7 @@ from warp_spo.examples import (
     newton_ground,
     options,
     parts,
+    push,
     reach,
     slider_crank,
     spinning_beam,
@@ -48,6 +49,13 @@ def test_a_leg_learns_to_hop(iterations, left, tmp_path, device):
     losses = hop.main(iterations=iterations, device=str(device), picture=tmp_path / "hop.svg")
     assert losses[-1] <= left * losses[0]  # 0.02 after 60 iterations here
     assert_is_whole((tmp_path / "hop.svg").read_text())
+
+
+@pytest.mark.slow
+def test_a_finger_learns_a_push(tmp_path, device):
+    losses, miss = push.main(device=str(device), picture=tmp_path / "push.svg")
+    assert losses[-1] <= 1e-3 * losses[0] and miss <= 2.0  # 2e-5 and 0.15 mm here
+    assert_is_whole((tmp_path / "push.svg").read_text())
 
 
 def test_a_double_fourbar_ends_where_the_benchmark_says(tmp_path, device):

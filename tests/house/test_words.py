@@ -13,8 +13,8 @@ KERNELS = pathlib.Path(warp_spo.kernels.__path__[0])
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if "kernels" not in path.relative_to(PACKAGE).parts)
 FILES += sorted(KERNELS.glob("*.py"))
 
-WAITING = {"aggregates", "coupled", "couples", "pair_pieces", "pairs", "ties"}
-"""Files of ``recursions/contact`` that the redesign of body contact deletes; so does it ``kernels/coupling*``."""
+WAITING = {"aggregates", "coupled", "pairs", "ties"}
+"""Files of ``recursions/contact`` that go, with ``kernels/couple*``, once all pairs are solved in joint space."""
 
 CLASSES = {
     "Carried": "ContactLinkMotion", "Choice": "ShapeSelection", "Chosen": "SelectedContacts",
@@ -62,7 +62,7 @@ MODULES = {
 def waits(path):
     """Return whether a file waits for the redesign of body contact."""
     if path.parent == KERNELS:
-        return path.stem == "couples" or path.stem.startswith("coupling")
+        return path.stem.startswith("couple")
     return path.parent == PACKAGE / "recursions" / "contact" and path.stem in WAITING
 
 

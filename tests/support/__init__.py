@@ -27,8 +27,9 @@ Truths and laws:
     ``laws`` (of every operation), ``oracles`` (Pinocchio, MuJoCo), ``reference_cases``, ``closed_loops`` (Lagrange's
     equations), ``gradients`` (the operations that torch differentiates).
 Traces and kernels without a compiler or a GPU:
-    ``symbolic`` (traces evaluated by NumPy), ``warp_machine`` (the CUDA text of teams, run in Python), ``routines``,
-    ``granularities``, ``mutants`` (kernel files with a planted bug), ``allocations``.
+    ``symbolic`` (traces evaluated by NumPy), ``warp_machine`` (the CUDA text of teams, run in Python),
+    ``host_lanes`` (a warp as threads of the host), ``routines``, ``granularities``,
+    ``mutants`` (kernel files with a planted bug), ``allocations``.
 Others:
     ``quick`` (parameters of which a quick run takes some), ``benchmark_results``, ``rendering`` (pictures),
     ``typing_user``.

@@ -184,11 +184,17 @@ def differences(scene, a, h, passes, cotangents, name, advance=step, chosen=None
     return np.where(crossed, np.nan, found)
 
 
-def errors(scene, a, h, passes, seed=0, names=None):
-    """By name: the largest error of a gradient over the world's largest entry, and the share of entries at switches."""
+def draw_cotangents(a, seed):
     rng = np.random.default_rng(seed)
-    cotangents = [rng.normal(size=a[name].shape) for name in ("q", "qd")]
-    wrt = tuple(names or a)
+    return [rng.normal(size=a[name].shape) for name in ("q", "qd")]
+
+
+def errors(scene, a, h, passes, seed=0, names=None, wanted=None):
+    """By name: the largest error of a gradient over the world's largest entry, and the share of entries at switches.
+
+    ``wanted``: differences by name with the cotangents of ``seed``; None: they are taken here.
+    """
+    cotangents, wrt = draw_cotangents(a, seed), tuple(names or a)
     found, errors = gradient(scene, a, h, passes, cotangents, wrt), {}
     for name in wrt:
         mine, chosen = found[name].reshape(len(a[name]), -1), None
@@ -196,8 +202,8 @@ def errors(scene, a, h, passes, seed=0, names=None):
             touched = mine.any(axis=0)
             chosen = np.append(np.flatnonzero(touched), np.flatnonzero(~touched)[:: len(touched) // OTHERS])
             mine = mine[:, chosen]
-        wanted = differences(scene, a, h, passes, cotangents, name, chosen=chosen)
+        true = wanted[name] if wanted else differences(scene, a, h, passes, cotangents, name, chosen=chosen)
         assert np.isfinite(mine).all(), name
         scale = np.maximum(abs(mine).max(axis=1, keepdims=True), 1e-12)
-        errors[name] = np.nanmax(abs(mine - wanted) / scale), np.isnan(wanted).mean()
+        errors[name] = np.nanmax(abs(mine - true) / scale), np.isnan(true).mean()
     return errors

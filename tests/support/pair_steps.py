@@ -5,8 +5,6 @@ import textwrap
 
 import numpy as np
 
-from warp_spo.dynamics.stepping import joint_space
-from warp_spo.recursions.contact import coupled, pair_pieces
 from warp_spo.reference.body_contact import PairStep
 
 from .pair_scenes import H, stepped
@@ -72,16 +70,3 @@ def plant(monkeypatch, place, old, new, text="NATIVE"):
     exec(source.replace(old, new), names)
     owner = getattr(inspect.getmodule(place), place.__qualname__.split(".")[0])
     monkeypatch.setattr(owner, place.__name__, names[place.__name__])
-
-
-def leave_to_generated_code(monkeypatch):
-    """Let no scene be solved in joint space, as those that lack something there."""
-    monkeypatch.setattr(joint_space, "lacking", lambda scene, variable: "pairs of this test")
-
-
-def respond_by_whole_trees(monkeypatch):
-    """Let kernels find the response to pairs by sweeps over whole trees, as where limbs and aggregates cannot share."""
-    for each in ("is_supported", "by_limbs"):
-        monkeypatch.setattr(pair_pieces, each, lambda scene: False)
-    monkeypatch.setattr(coupled, "is_supported", lambda links: False)
-    leave_to_generated_code(monkeypatch)

@@ -9,13 +9,14 @@ import warp as wp
 import warp_spo as spo
 from warp_spo.kernels import hull_clipping, hull_distance, narrow_phase, native
 from warp_spo.kernels.elementary import C_TYPE, NATIVE
-from warp_spo.recursions.contact.couples import Polyhedron
+from warp_spo.recursions.contact.pairs import Polyhedron
 from warp_spo.reference import body_contact
 from warp_spo.reference.rotations import homogeneous
 
 from .pair_scenes import WEDGE
 from .pair_steps import plant
 
+HEADER = 3  # values before the touches of a pair: where the second body is from the first
 ENTRIES = 11  # of a shape: its pose in the body, half its sizes, its radius
 
 FIND = r"""
@@ -88,7 +89,7 @@ def find_touches(T, of=()) -> wp.Kernel:
     text = hull_distance.lines(FIND, bool(of)).replace("REAL", C_TYPE[T]).replace("UNROLL\n", "#pragma unroll\n")
     for name, value in {
         "ENTRIES": ENTRIES,
-        "HEADER": narrow_phase.HEADER,
+        "HEADER": HEADER,
         "TOGETHER": hull_clipping.MOST if len(of) > 1 else narrow_phase.MOST,
     }.items():
         text = text.replace(name, str(value))
@@ -113,12 +114,12 @@ def touches_found(device, poses, kinds, shapes, hulls, most, dtype=wp.float64):
     ``poses`` [world, 2, 7] are those of the bodies, ``shapes`` [2, ENTRIES] the shapes in them, ``hulls`` the corners
     of the hulls that ``kinds`` number.
     """
-    out = wp.full((narrow_phase.HEADER + most * narrow_phase.POINT, len(poses)), np.nan, dtype=dtype, device=device)
+    out = wp.full((HEADER + most * narrow_phase.POINT, len(poses)), np.nan, dtype=dtype, device=device)
     given = [wp.array(poses, dtype=dtype, device=device), wp.array([[0, 1, *kinds, 0]], dtype=int, device=device),
              wp.array(shapes, dtype=dtype, device=device)]  # fmt: skip
     find = find_touches(dtype, tuple(map(polyhedron, hulls)))
     wp.launch(find, (1, len(poses)), given, [out], device=device)
-    return np.float64(out.numpy())[narrow_phase.HEADER :].T.reshape(len(poses), most, narrow_phase.POINT)
+    return np.float64(out.numpy())[HEADER:].T.reshape(len(poses), most, narrow_phase.POINT)
 
 
 def random_shape(rng, kind):

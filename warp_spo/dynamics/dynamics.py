@@ -58,6 +58,7 @@ from .refinement import Refinement
 from .stepping import contact_options
 from .stepping import step as steps
 from .stepping.joint_space import JointSpaceStep, choose_solver
+from .stepping.joint_space_gradients import JointSpaceGradients
 
 MOST_WORLDS = 2**31 - 1  # of an axis of a Warp array
 
@@ -334,6 +335,11 @@ class Dynamics:
     def _joint_space(self) -> JointSpaceStep | None:
         """The solver of pairs of bodies in joint space; None without pairs, or where generated code solves them."""
         return choose_solver(self)
+
+    @functools.cached_property
+    def _joint_gradients(self) -> JointSpaceGradients:
+        """The gradients of steps of scenes in which bodies touch."""
+        return JointSpaceGradients(self._joint_space or JointSpaceStep(self))
 
     @functools.cached_property
     def _later_status(self) -> wp.array:

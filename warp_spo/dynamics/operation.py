@@ -261,6 +261,7 @@ class Derivative:
             kernel, by :meth:`.engine.Engine.launch`.
         refuses: ``refuses(dyn, arguments)``, "what came; what is expected" of arguments with which a call has no
             gradient; otherwise "".
+        adds: ``adds(dyn)``, arguments by name that a call with a way back has besides those of the caller.
         repeats: ``repeats(call, arguments)`` takes out of the arguments how often the operation runs on its own
             results, and returns it; the results have the names of the arguments that they replace.
         lacking: ``lacking(links)``, "what; way out" where the derivative does not support the scene; otherwise "".
@@ -278,6 +279,7 @@ class Derivative:
     pull: Pull | None = None
     launch: Callable[..., Any] | None = None
     refuses: Callable[[Any, dict[str, Any]], str] = lambda dyn, arguments: ""
+    adds: Callable[[Any], dict[str, Any]] = lambda dyn: {}
     repeats: Callable[[str, dict[str, Any]], int] = lambda call, arguments: 1
     lacking: Callable[[Links], str] = lambda links: ""
 

@@ -96,8 +96,6 @@ def _tune_one(dyn: Dynamics, operation: Operation) -> Tuned:
     dyn._engine.refuse(operation.name, operation)
     routine = _routine(dyn, operation)
     candidates = dyn.plan.candidates(routine)
-    if routine.couples_bodies and not routine.divides(dyn.scene, ()):
-        candidates = ("tree",)
     if len(candidates) == 1:
         return Tuned(candidates[0])
     return _choose(dyn, routine.name, candidates, lambda: _measure(dyn, operation, routine, candidates))

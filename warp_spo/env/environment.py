@@ -152,13 +152,10 @@ class Env(VecEnv):
         store = self._store = self._allocate(tracing)
         self.q, self.qd, self.actions, self.chosen = (store.tensors[n] for n in ("q", "qd", "actions", "chosen"))
         self._tensors, self._controls, self._report = store.tensors, store.controls, StepReport(**store.written)
-        substeps = 1 if self._learned else self.decimation  # networks are evaluated before each
-        self._step_options = StepOptions(substeps=substeps, passes=self._passes)
-        device = self.warp_device
-        self._networks = (
-            ActuatorLaunches(self._learned, self._layout, store, decimation, device) if self._learned else None
-        )
         self.values, self._actuator_state = store.values, self._delay_buffers(events)
+        self._networks = self._actuator_launches()  # None: the kernel of the step evaluates networks, or there are none
+        substeps = self.decimation if self._networks is None else 1
+        self._step_options = StepOptions(substeps=substeps, passes=self._passes)
         self._log = Log(self._layout, self.reward_names, self.termination_names, self.device, worlds)
         points, seen = len(scene.contact_points), tracing.observed_entries
         of_pairs = any(array == "contact_gap" and entry >= points for array, entry in seen)
@@ -202,6 +199,14 @@ class Env(VecEnv):
         held = self.dyn.recursions.parameters
         tables = {name: wp.to_torch(getattr(held, of_ground[name])) for name in of_ground.keys() & tracing.tables}
         return Storage(self._layout, self.num_envs, self.device, tracing.arrays, results, tracing.apart, tables)
+
+    def _actuator_launches(self) -> ActuatorLaunches | None:
+        """Return the kernels of learned actuators, None where there are none beside that of the step."""
+        if not self._learned:
+            return None
+        found = ActuatorLaunches(self._learned, self._layout, self._store, self.decimation, self.warp_device)
+        given = "ctrl" in self._controls, self._actuator_state is not None, self._passes
+        return None if found.join(self.dyn, *given) else found
 
     def _delay_buffers(self, events: Sequence[Any]) -> Any:
         """Return the buffers of actuators with delays, None where there are none."""

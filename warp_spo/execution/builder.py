@@ -6,11 +6,12 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from ..kernels import coupling, native, straight_line
+from ..kernels import native, straight_line
 from ..kernels.fields import axes
 from ..kernels.native import INTEGERS
 from ..kernels.straight_line import BY_TABLE, TILED, KernelLayout
-from ..recursions.contact import coupled, pairs
+from ..kernels.substeps import SUBSTEPS, Before
+from ..recursions.contact import coupled
 from ..recursions.contact.ground import GROUND
 from ..recursions.contact.secant_laws import SECANT
 from ..recursions.model.flexible import attach
@@ -82,11 +83,13 @@ class Builder:
 
     Attributes:
         relays: what is too long for shared memory waits in the rows of the result.
+        before: code that runs before each substep of kernels that take several, and its arrays by name.
     """
 
     def __init__(self, run: Sweeps, plan: Plan):
         self.run, self.plan, self.dtype = run, plan, run.dtype.__name__
         self.relays = run.device.is_cuda
+        self.before: list[tuple[Before, dict[str, wp.array]]] = []
         self._links: Links | None = None
         self._supports_body_kinematics: bool | None = None
 
@@ -131,16 +134,16 @@ class Builder:
         wide = routine.segments is not None and routine.segments.wide and warps > 1
         room = self.room(wide, whole=whole)
         given = stores, everything, job.shapes, more, sent, warps, self.run.dtype
-        return staging.choose_layout(*given, *ways, self.relays, room, wide)
+        before = tuple(code for code, _ in self.before) if SUBSTEPS in job.shapes else ()
+        return staging.choose_layout(*given, *ways, self.relays, room, wide, before)
 
-    def room(self, wide: bool = False, couples: bool = False, whole: bool = False) -> int:
+    def room(self, wide: bool = False, whole: bool = False) -> int:
         """Bytes of shared memory that a block may have: for as many scalars in float64 as in float32 if the GPU can.
 
-        ``wide``: for long rows that all go through it. ``couples``: for what segments couple in it. ``whole``: all that
-        a multiprocessor has.
+        ``wide``: for long rows that all go through it. ``whole``: all that a multiprocessor has.
         """
-        more = straight_line.COUPLED_BYTES if couples else straight_line.WIDE_BYTES if wide else 0
-        wanted = max(straight_line.SHARED_BYTES, more) * wp.types.type_size_in_bytes(self.run.dtype) // 4
+        most = max(straight_line.SHARED_BYTES, straight_line.WIDE_BYTES if wide else 0)
+        wanted = most * wp.types.type_size_in_bytes(self.run.dtype) // 4
         allowed = self.plan.device.shared_bytes - 3 * RESERVED  # Warp takes a share, too
         wanted = max(wanted, allowed) if whole else wanted
         return min(wanted, max(allowed, straight_line.SHARED_BYTES)) if self.plan.device.cuda else wanted
@@ -149,11 +152,6 @@ class Builder:
         """Return the table of the ground's cells, if a program ``reads`` it."""
         ground = self.run.scene.ground
         return {GROUND: self.run.parameters.ground_cells} if reads and isinstance(ground, HeightField) else {}
-
-    def touch_tables(self, points: tuple[int, ...]) -> dict[str, Any]:
-        """Return the array of touches, for so many points of each pair of bodies."""
-        shape = coupling.entries(points)[-1], coupling.columns(self.run.worlds)
-        return {"touches": self.run.array("touches", *shape)}
 
     def finish(
         self,
@@ -179,6 +177,7 @@ class Builder:
         rows, fields = (*(row.name for row in layout.rows), *layout.numbers), tuple(layout.fields)
         arrays = [(row.name, row.ndim) for row in layout.rows] + [(name, 0) for name in layout.numbers]
         arrays += [(name, axes(name)) for name in fields]
+        tables = tables | {name: array for _, arrays in self.before for name, array in arrays.items() if layout.before}
         result, entry, places = layout.result, None, ()
         if result.way in BY_TABLE:
             tables = tables | {"place": result.slot_layout.table(tables["place"], self.run.dtype)}
@@ -211,6 +210,6 @@ class Builder:
 
 def flatten(item: Store, shapes: dict[str, tuple[int, ...]]) -> Store:
     """Return a store with one index; entries of a kernel's own arrays have one already."""
-    if item.array in (INWARD, OUTWARD, *PASSED, *pairs.READ, *coupled.ARRAYS):
+    if item.array in (INWARD, OUTWARD, *PASSED, *coupled.ARRAYS):
         return item
     return item._replace(index=(staging.flat_index(item.index, shapes[item.array][1:]),))

@@ -7,8 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..kernels import joint_space
+from ..recursions.contact import coupled
 from ..recursions.contact.pairs import inverse_weights
 from ..recursions.contact.points import inverse_weights as point_weights
+from ..recursions.model.links import Links
 from ..recursions.step.joint_laws import DEFAULT_BOUND, HOLD, neutral_inertias
 from ..scene.contact_values import TURNING_VALUES
 from ..scene.parts import UNLIMITED
@@ -100,10 +102,25 @@ def lacking(scene: Scene, variable: tuple[str, ...]) -> str:
     return lacks[0] if lacks else ""
 
 
-def why_few_pairs(scene: Scene) -> str:
-    """Return why steps of a scene take only few pairs, whose code is generated; "" if joint space takes many."""
+def why_unsolved(scene: Scene) -> str:
+    """Return why no step takes the pairs of a scene; "" if one does, by generated code for few or in joint space."""
     lacks = lacking(scene, ())
-    return f"steps of a scene with {lacks} do not solve such pairs in joint space" if lacks else ""
+    if not lacks or coupled.is_supported(Links(scene)):
+        return ""
+    return f"steps of a scene with {lacks} do not solve such pairs in joint space"
+
+
+def way_out(lacks: str) -> str:
+    """Return what a user may do about pairs in a scene that lacks something, see :func:`lacking`."""
+    ways = {
+        "bodies with modes": "leave out modes= of its bodies",
+        "dofs without inertia": "give their bodies mass, or their hinges armature=",
+        "boxes without thickness": "give boxes half sizes above zero",
+        **{name.removeprefix("contact_").replace("_", " "): f"set {name} to zero, and leave it out of variable="
+           for name in TURNING_VALUES},
+    }  # fmt: skip
+    way = ways.get(lacks, "use another solver, such as Newton's SolverMuJoCo")
+    return f"{way}; or list few pairs of capsules, boxes and hulls, which need no joint space"
 
 
 def motor_laws(scene: Scene, variable: tuple[str, ...]) -> tuple[int, ...]:

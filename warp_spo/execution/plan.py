@@ -131,9 +131,6 @@ class Plan:
         """
         if self.granularity == "node" or self.leaf_segments == 1 or self.leaf_segments > MOST_WARPS:
             return self.granularity
-        if routine.couples_bodies:
-            few = self.segments_share_code and self.worlds <= self.device.scaled(SHARED_CODE_WORLDS)
-            return "segment" if few else "tree"
         if routine.is_counted and not self.segments_share_code and self.dofs <= HELD:
             return "tree"
         if routine.hints.long_result or routine.passes is not None or routine.hints.crowded:

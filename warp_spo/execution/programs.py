@@ -7,7 +7,6 @@ from typing import Any
 import warp as wp
 
 from ..kernels.substeps import SUBSTEPS
-from ..recursions.contact import coupled
 from ..recursions.model.links import TABLES, Links
 from ..recursions.model.segments import Segments
 from ..runtime import launches
@@ -139,22 +138,16 @@ class Programs:
             return None
         if routine.start is not None:
             return multi_start.build(self, routine, links, "given" in inputs, options)
-        divides = routine.divides(self.run.scene, inputs, **options)
-        shared = self.plan.of(routine) == "segment" and divides
+        shared = self.plan.of(routine) == "segment" and routine.divides(self.run.scene, inputs, **options)
         if shared and routine.segments and routine.segments.body_kinematics and self.builder.supports_body_kinematics:
             return body_kinematics.build(self.builder, job, links)
         if routine.hints.bias_first is not None and self.plan.at(routine).bias_first and "qd" in inputs:
             job = job._replace(routine=routine.hints.bias_first)
-        ways = [dict(alone=False)] if shared else []
-        if routine.couples_bodies and divides and not coupled.is_supported(links):
-            ways += [dict(alone=True), dict(alone=True, local=True)]
-        segments = Segments(links) if ways else None
-        for way in ways:
-            assert segments is not None
-            if 1 < len(segments.leaves) <= MOST_WARPS or way["alone"]:
-                program = segment_programs.build(self.builder, job, segments, **way)
-                if program is not None:
-                    return program
+        segments = Segments(links) if shared else None
+        if segments is not None and 1 < len(segments.leaves) <= MOST_WARPS:
+            program = segment_programs.build(self.builder, job, segments)
+            if program is not None:
+                return program
         return None if options.get(BODIES) else tree_programs.build(self.builder, job, links)
 
 

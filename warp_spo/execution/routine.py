@@ -28,14 +28,12 @@ class SegmentForm:
         wide: rows are long, so that a block asks for as much shared memory as they need.
         body_kinematics: warps go from the roots to the bodies in loops over a table of links, see
             :mod:`.segment.body_kinematics`.
-        couples_bodies: native code couples pairs of bodies between the sweeps of the segments.
     """
 
     messages: str = ""
     divides: Callable[..., bool] = _always
     wide: bool = False
     body_kinematics: bool = False
-    couples_bodies: bool = False
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -118,11 +116,6 @@ class Routine:
     def divides(self, *args: Any, **options: Any) -> bool:
         """Return whether segments can share the work; arguments as of :attr:`SegmentForm.divides`."""
         return self.segments is not None and self.segments.divides(*args, **options)
-
-    @property
-    def couples_bodies(self) -> bool:
-        """Whether native code couples pairs of bodies between the sweeps of segments."""
-        return self.segments is not None and self.segments.couples_bodies
 
     @property
     def is_counted(self) -> bool:

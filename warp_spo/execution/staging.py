@@ -21,7 +21,7 @@ from ..kernels.straight_line import (
     KernelLayout,
     ResultLayout,
 )
-from ..kernels.substeps import SUBSTEPS
+from ..kernels.substeps import SUBSTEPS, Before
 from ..recursions.model.links import TABLES
 from ..scene.actuators import ACTUATOR_VALUES
 from ..scene.contact_values import CONTACT_VALUES
@@ -50,6 +50,7 @@ def choose_layout(
     relays: bool,
     room: int,
     wide: bool = False,
+    before: tuple[Before, ...] = (),
 ) -> KernelLayout:
     """Return the first layout in the order of preference that fits into shared memory.
 
@@ -67,6 +68,7 @@ def choose_layout(
         relays: a result that does not fit into shared memory may wait in its own rows, see ``kernels.long_results``.
         room: the bytes of shared memory that a block may have.
         wide: there is room for long results as they are, without a table of their distinct values.
+        before: code that runs before each substep.
 
     Returns:
         The first layout that fits into ``room``; if none does, the last one.
@@ -110,6 +112,7 @@ def choose_layout(
             cached=entries,
             numbers=numbers,
             repeats=SUBSTEPS in shapes,
+            before=before,
         )
         for rows_staged, result in ways
         for together in ((True, False) if other_results and result.way in (IN_PLACE, STAGED) else (False,))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ..kernels import couples as couple_points
-from ..kernels import coupling, pass_loops
+from ..kernels import pass_loops
 from ..kernels.long_results import WARP_SIZE
 from ..kernels.straight_line import DIRECT, RELAYED, TILED, KernelLayout
 from ..recursions.contact import coupled, pairs
@@ -43,9 +43,8 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
     placed, table = staging.arrange_stores(outs, layout.result)
     placed += apart
     emitter = make_emitter(dtype, shapes, layout, branches=aggregates)
-    responses = [item for item in stores if item.array in pairs.READ]
     regions = [emitter.region(phases.prologue, phases.pass_invariants)] if looped else []
-    regions += emitter.branches([responses, looped] if responses else [looped]) if looped else []
+    regions += emitter.branches([looped]) if looped else []
     listings = [*regions, emitter.region(placed)]
     tables: dict[str, Any] = {} if table is None else {"place": table}
     loops = equal_blocks.share(listings, dtype) if links.graph.apart else None
@@ -57,13 +56,6 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
     tables |= builder.height_tables(emitter.counts["lookup"] > 0)
     if phases.prologue:
         entries = {GAIN: run.scene.dof_count, SECANT: max(1, sum(item.array == SECANT for item in phases.prologue))}
-        if responses:
-            couples = _couples(links)
-            entries |= coupling.shared_arrays(couples)
-            first, read, *rest = before
-            declared = coupling.declare(couples, run.dtype)
-            before = [f"{declared}\n{first}\n{coupling.BEGIN}", "\n".join([read, coupling.PASS, *rest])]
-            tables |= builder.touch_tables(couples.points)
         if not aggregates:
             body = pass_loops.repeat_counted_passes([*before, body], entries, run.dtype)
     elif looped:
@@ -77,7 +69,7 @@ def build(builder: Builder, job: Job, links: Links) -> Program:
     layout = layout._replace(retries=layout.retries and "farthest" in body, block=block, direct=direct, late=late)
     cuda = cpu = body
     if aggregates:
-        found = _couples_of_aggregates(links, options, coupled.REPORT in body)
+        found = _couples(links, options, coupled.REPORT in body)
         layout, cuda, cpu = _coupled_step(builder, layout, found, [*before, body], entries)
     return builder.finish(routine, layout, cuda, cpu, tables, emitter.operations)
 
@@ -101,22 +93,13 @@ def _coupled_step(
     return team, couple_points.text(couples, parts, entries, T, warps), cpu
 
 
-def _couples(links: Links) -> coupling.CoupledPairs:
+def _couples(links: Links, options: dict[str, Any], reports: bool) -> couple_points.Couples:
     """Return the pairs of bodies of a scene as their native code needs them."""
-    scene, of_pairs = links.scene, pairs.members(links).of_pairs
-    points, eps = zip(*((pair.points, pair.eps) for pair in scene.contact_pairs), strict=True)
-    return coupling.CoupledPairs(
-        of_pairs, points, eps, tuple(pairs.inverse_weights(scene)), pairs.blocks(links), pairs.solids_of(links)[0]
-    )
-
-
-def _couples_of_aggregates(links: Links, options: dict[str, Any], reports: bool) -> couple_points.Couples:
-    """Return the pairs of bodies of a scene as aggregates couple them, as their native code needs them."""
     scene, couples = links.scene, couples_of(links)
     signs = dict(one for couple in couples for one in zip(couple.pairs, couple.signs, strict=True))
     points, eps = zip(*((pair.points, pair.eps) for pair in scene.contact_pairs), strict=True)
     looks = bool({"contact_gap", "contact_slip"} & set(options.get("reports", ())))
     return couple_points.Couples(
         tuple(couple.pairs for couple in couples), tuple(signs[i] for i in range(len(points))), points, eps,
-        tuple(pairs.inverse_weights(scene)), pairs.solids_of(links)[0], looks, reports,
+        tuple(pairs.inverse_weights(scene)), pairs.solids_of(scene), looks, reports,
     )  # fmt: skip

@@ -92,19 +92,25 @@ class JaxOperation:
         """Return arguments of one call, its results, and what it writes: the status, and what the derivative keeps."""
         keeps = self.operation.derivative.keeps if keep and self.operation.derivative else ()
         given, written = self._samples(), self._arrays_to_write((*self._status, *keeps))
-        results = self._compute(given, **written)
+        results = self._compute(given, **written, **self._added(keep))
         return given, (results,) if self.count == 1 else tuple(results), written
+
+    def _added(self, keep: bool) -> dict[str, Any]:
+        """Return the options that a call with a way back has besides those of the caller."""
+        derivative = self.operation.derivative
+        return derivative.adds(self.dyn) if keep and derivative is not None else {}
 
     def _forward(self, keep: bool) -> Traced:
         """Return the operation as a JAX function; its results are followed by what else it writes."""
         given, results, written = self._run_once(keep)
+        added = self._added(keep)
 
         def run(inputs: Arrays, outputs: Arrays) -> None:
             for part in self._parts(inputs[0].shape[0]):
                 found = [part(array) for array in outputs]
                 out = found[0] if self.count == 1 else tuple(found[: self.count])
                 more = dict(zip(written, found[self.count :], strict=True))
-                self._compute(dict(zip(given, map(part, inputs), strict=True)), out=out, **more)
+                self._compute(dict(zip(given, map(part, inputs), strict=True)), out=out, **more, **added)
 
         forms = forms_of((*results, *written.values()))
         name, read = self.operation.name, forms_of(given.values())

@@ -43,7 +43,6 @@ def read_actuators(source: Source, mechanism: Mechanism) -> list[Actuator]:
     limited = model.actuator_ctrllimited.astype(bool) & (not source.disabled("CLAMPCTRL"))
     found = []
     for actuator, gears in enumerate(joints):
-        name = source.name("actuator", actuator)
         gain, bias = _gain_and_bias(source, actuator)
         found.append(
             Actuator(
@@ -54,7 +53,7 @@ def read_actuators(source: Source, mechanism: Mechanism) -> list[Actuator]:
                 ctrl_range=model.actuator_ctrlrange[actuator] if limited[actuator] else UNBOUNDED,
                 force_range=ranges[actuator],
                 strength=0.0 if actuator in off else 1.0,
-                label=name or f"actuator_{actuator}",
+                label=source.label("actuator", actuator, f"actuator_{actuator}"),
             )
         )
     return found
@@ -143,6 +142,10 @@ def _force_ranges(source: Source, joints: list[dict[int, float]]) -> list[tuple[
                 f"{source.words('joint', int(joint))}, whose uneven actuatorfrcrange bounds the sum of several "
                 "actuators or one of several joints of a tendon,",
                 "let its ends be opposite numbers, or write forcerange on the actuators",
+            )
+        if not own:
+            source.left_out.append(
+                f"the uneven actuatorfrcrange of {source.words('joint', int(joint))}, which has no actuator"
             )
         for actuator in own:
             low, high = sorted(m.jnt_actfrcrange[joint] / joints[actuator][int(joint)])

@@ -76,7 +76,7 @@ def _loop(source: Source, index: int, kind: int) -> Loop | None:
         ends.reverse()
     (parent, parent_pose), (child, child_pose) = ends
     turns = kind == CONNECT or data[10] == 0.0  # a weld of torquescale 0 does not hold the orientation
-    label = source.name("equality", index) or f"equality_{index}"
+    label = source.label("equality", index, f"equality_{index}")
     return Loop(
         "ball" if turns else "fixed",
         parent - 1,

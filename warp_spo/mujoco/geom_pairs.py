@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..execution.joint_tables import why_few_pairs
+from ..execution.joint_tables import why_unsolved
 from ..scene.collision_shapes import CollisionShape
 from ..scene.scene import Scene
 from ..scene.shape_pairs import PairSelection, ShapePair
@@ -15,7 +15,7 @@ def geom_pairs(source: Source, scene: Scene) -> PairSelection:
     filtered = GeomFilter(source, scene)
     shapes = [geom_shape(source, geom, None, 0.0) for geom in solid_geoms(source)]
     numbers = {shape.index: shape for shape in shapes}
-    return PairSelection(source.title, scene, shapes, filtered.collide, numbers, filtered.as_pair, True, why_few_pairs)
+    return PairSelection(source.title, scene, shapes, filtered.collide, numbers, filtered.as_pair, True, why_unsolved)
 
 
 class GeomFilter:

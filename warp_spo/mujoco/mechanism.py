@@ -44,6 +44,7 @@ class Mechanism:
     def __init__(self, source: Source, floating: bool | None = None):
         self.source = source
         model = source.model
+        self._labels = [source.label("body", body, f"body_{body - 1}") for body in range(model.nbody)]
         self.bodies = [self._body(body) for body in range(1, model.nbody)]
         self.hinges: list[Hinge] = []
         self.hinge_of: dict[int, int] = {}
@@ -80,7 +81,11 @@ class Mechanism:
         )
 
     def _label(self, body: int) -> str:
-        return self.source.name("body", body) or f"body_{body - 1}"
+        return self._labels[body]
+
+    def _joint_label(self, wanted: str) -> str:
+        """Return a label for a hinge that is none of the model's joints."""
+        return self.source.label("joint", -1, wanted)
 
     def _add_massless(self, label: str) -> int:
         self.bodies.append(Body(0.0, label=label))
@@ -93,14 +98,16 @@ class Mechanism:
         joints = range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body])
         parent, pose = int(m.body_parentid[body]) - 1, body_pose(m, body)
         for place, joint in enumerate(joints):
-            label = self.source.name("joint", joint) or f"{own}_joint{place or ''}"
+            label = self.source.label("joint", joint, f"{own}_joint{place or ''}")
             last = joint == joints[-1] and not self._acts_at_frame(joint)
-            child = body - 1 if last else self._add_massless(f"{own}:{label}")
+            child = body - 1 if last else self._add_massless(self.source.label("body", -1, f"{own}:{label}"))
             self.hinge_of[joint] = len(self.hinges)
             self.hinges.append(self._hinge(joint, parent, child, pose, label))
             parent, pose = child, np.array(IDENTITY_POSE)
         if parent != body - 1:
-            self.hinges.append(Hinge("fixed", parent, body - 1, parent_pose=pose, label=f"{own}_fixed"))
+            self.hinges.append(
+                Hinge("fixed", parent, body - 1, parent_pose=pose, label=self._joint_label(f"{own}_fixed"))
+            )
 
     def _acts_at_frame(self, joint: int) -> bool:
         """Whether a free joint has armature, damping, friction or a spring that acts at the body frame's origin.
@@ -185,9 +192,9 @@ class Mechanism:
         pose, own = body_pose(self.source.model, body), self._label(body)
         if floating:
             self.starts[len(self.hinges)] = pose
-            self.hinges.append(Hinge("free", -1, body - 1, rest=pose, label=f"{own}_free"))
+            self.hinges.append(Hinge("free", -1, body - 1, rest=pose, label=self._joint_label(f"{own}_free")))
         else:
-            self.hinges.append(Hinge("fixed", -1, body - 1, parent_pose=pose, label=f"{own}_fixed"))
+            self.hinges.append(Hinge("fixed", -1, body - 1, parent_pose=pose, label=self._joint_label(f"{own}_fixed")))
 
 
 def actuator_output(source: Source, actuator: int) -> int:

@@ -123,10 +123,10 @@ def _sites(source: Source) -> dict[str, tuple[int, np.ndarray]]:
 
 
 def _keyframes(source: Source, mechanism: Mechanism) -> dict[str, Keyframe]:
-    """Return the keyframes by name; those without a name are ``key_0``, ``key_1`` by their place."""
+    """Return the keyframes by name; those without a name are ``key_0``, ``key_1`` by their place, if none has it."""
     m = source.model
     return {
-        source.name("key", key) or f"key_{key}": Keyframe(
+        source.label("key", key, f"key_{key}"): Keyframe(
             *state_of(source, mechanism, m.key_qpos[key], m.key_qvel[key]), np.array(m.key_ctrl[key])
         )
         for key in range(m.nkey)

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from ..errors import UnsupportedError, quoted
+from ..scene.labels import unused_label
 
 
 class Source:
@@ -35,6 +36,7 @@ class Source:
     ):
         self.model, self.call, self.file, self.missing = model, call, file, missing
         self.left_out: list[str] = []
+        self._taken: dict[str, set[str]] = {}
 
     @property
     def title(self) -> str:
@@ -44,6 +46,18 @@ class Source:
     def name(self, kind: str, index: int) -> str:
         """Return the name of an element, "" if it has none; ``kind`` is "body", "joint", "actuator" and so on."""
         return mujoco.mj_id2name(self.model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), index) or ""
+
+    def label(self, kind: str, index: int, wanted: str) -> str:
+        """Return the name of an element, or ``wanted`` if it has none, or another that no element of its kind has.
+
+        Labels that were given before are not given again; an ``index`` of -1 is that of a part that the model has not.
+        """
+        if kind not in self._taken:
+            size = {"body": "nbody", "joint": "njnt", "actuator": "nactuator", "key": "nkey", "equality": "neq"}[kind]
+            count = self.count(size) or self.model.nu if kind == "actuator" else self.count(size)
+            self._taken[kind] = {self.name(kind, other) for other in range(count)}
+        own = self.name(kind, index) if index >= 0 else ""
+        return own or unused_label(wanted, self._taken[kind])
 
     def words(self, kind: str, index: int) -> str:
         """Return an element's kind and name for a message, such as ``joint 'knee'``."""

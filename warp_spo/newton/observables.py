@@ -13,7 +13,7 @@ from ..dynamics.dynamics import Dynamics
 from ..runtime.memory import view
 from .layout import StateLayouts
 
-OF_CONTACTS = frozenset({"contact_f", "contact_slip", "contact_residual"})
+OF_CONTACTS = frozenset({"contact_f", "contact_slip"})
 
 
 @dataclasses.dataclass(eq=False)
@@ -39,11 +39,6 @@ class Observables(SolverBase.Observables):
     )
     """Speed of each contact point along the ground, and of the bodies of each pair along each other, after the step
     [m/s], shape (world_count, points + pairs)."""
-    contact_residual: Any = SolverBase.Observables.field(  # noqa: RUF009
-        dtype=wp.float32, frequency=newton.Model.AttributeFrequency.WORLD
-    )
-    """Largest change of a pair's force in the last round [N], where pairs are solved in rounds; else 0. Shape
-    (world_count,)."""
 
 
 class ObservableArrays:
@@ -52,7 +47,6 @@ class ObservableArrays:
     Args:
         dynamics: The solver's dynamics.
         layouts: How Newton's state is laid out.
-        paired: Whether pairs of bodies touch each other.
         substeps: Of a step.
 
     Attributes:
@@ -67,15 +61,13 @@ class ObservableArrays:
     }
     """Names of all observables that some solver has."""
 
-    def __init__(self, dynamics: Dynamics, layouts: StateLayouts, paired: bool, substeps: int):
+    def __init__(self, dynamics: Dynamics, layouts: StateLayouts, substeps: int):
         self._dynamics, self._layouts, self._substeps = dynamics, layouts, substeps
         worlds, contacts = dynamics.worlds, dynamics.scene.contact_count
         self.status: Any = wp.zeros(worlds, dtype=wp.int32, device=dynamics.device)
         of_contacts: dict[str, tuple[tuple[int, ...], Any]] = {}
         if dynamics.scene.contacts:
             of_contacts = {"contact_f": ((worlds, contacts), wp.vec3), "contact_slip": ((worlds, contacts), wp.float32)}
-        if paired:
-            of_contacts["contact_residual"] = (worlds,), wp.float32
         self._unasked = {
             name: wp.zeros(shape, dtype=dtype, device=dynamics.device) for name, (shape, dtype) in of_contacts.items()
         }

@@ -11,10 +11,10 @@ import numpy as np
 import warp as wp
 
 from ..errors import UnsupportedError
-from ..execution.joint_tables import why_few_pairs
+from ..execution.joint_tables import why_unsolved
 from ..kernels import declare
 from ..kernels import newton_contacts as kernels
-from ..scene.collision_shapes import ALL, ShapeSelection
+from ..scene.collision_shapes import ShapeSelection
 from ..scene.contact_checks import unsaid_softness
 from ..scene.contact_values import TURNING_VALUES
 from ..scene.ground import GROUND_VALUES
@@ -40,10 +40,11 @@ def find_pairs(model: newton.Model, worlds: WorldRows, scene: Scene, asked: Any,
     if lacking:
         raise UnsupportedError("SolverSPO", f"pairs={asked!r} with {lacking}", "leave out one of them")
     shapes = ModelShapes(model, worlds)
-    selection = select_pairs("SolverSPO", shapes, scene, why_few=why_few_pairs)
+    selection = select_pairs("SolverSPO", shapes, scene, why_unsolved=why_unsolved)
     pairs, left_out = selection.resolve(asked)
-    if why := selection.reason_against(scene, pairs, listed=asked != ALL):
-        selection.refuse_many(pairs, why)
+    made = ModelPairs(shapes, pairs, selection)
+    if why := selection.reason_against(made.added_to(scene)):
+        selection.refuse(pairs, why)
     if left_out:
         more = f" and {len(left_out) - 4} more" if len(left_out) > 4 else ""
         warnings.warn(
@@ -51,7 +52,7 @@ def find_pairs(model: newton.Model, worlds: WorldRows, scene: Scene, asked: Any,
             UserWarning,
             stacklevel=4,
         )
-    return ModelPairs(shapes, pairs, selection)
+    return made
 
 
 def warn_of_bodies_apart(model: newton.Model, worlds: WorldRows, scene: Scene) -> None:
@@ -94,7 +95,7 @@ def with_model_contacts(model: newton.Model, worlds: WorldRows, scene: Scene, se
     """Return the scene, with contacts of chosen shapes of a model if some are wanted; warn of what is left out."""
     shapes = functools.cache(lambda: ModelShapes(model, worlds))
     between = functools.cache(
-        lambda: select_pairs("from_newton", shapes(), scene, takes_still=True, why_few=why_few_pairs)
+        lambda: select_pairs("from_newton", shapes(), scene, takes_still=True, why_unsolved=why_unsolved)
     )
 
     def touched(pairs: ModelPairs | None) -> tuple[Scene, list[str]]:
@@ -106,9 +107,9 @@ def with_model_contacts(model: newton.Model, worlds: WorldRows, scene: Scene, se
     touching, lost = selection.body_pairs(between)
     found, left_out = touched(ModelPairs(shapes(), touching, between()) if touching else None)
     if touching:
-        found, turning = selection.solvable(between(), found, touching)
+        found, turning = selection.solvable(between(), found)
         left_out = left_out + turning
-        why = selection.refuse_many(between(), found, touching)
+        why = selection.refuse_unsolved(between(), found, touching)
         if why:
             (found, left_out), lost = touched(None), between().missed(why)
         else:

@@ -131,7 +131,7 @@ class SolverSPO(MassMatrixInterface, SolverBase):
         passes: Of a step with contacts, see :meth:`warp_spo.Dynamics.step`.
         substeps: A step takes so many of dt / substeps, see there, and writes the bodies' states once. Joint forces of
             free joints on bodies keep the axes of the first. The observables are then status, contact_f (the mean),
-            contact_slip and contact_residual (of the last), and a tape records no step.
+            contact_slip (of the last), and a tape records no step.
         tune: Time the granularities at which the step can run, as :meth:`warp_spo.Dynamics.tune` does, and use the
             fastest. The choice is kept in a file, so that only the first solver of a model measures.
 
@@ -221,7 +221,7 @@ class SolverSPO(MassMatrixInterface, SolverBase):
         self._bodies = BodyStates(self.dynamics, state)
         self._arrays = ModelArrays(model, worlds, state, self._drives.factors, sources)
         self._words = StatusWords(model, worlds, touching, pairs)
-        self._observable_arrays = ObservableArrays(self.dynamics, state, pairs is not None, self._substeps)
+        self._observable_arrays = ObservableArrays(self.dynamics, state, self._substeps)
         self._joint_forces = JointForces(self.dynamics, state)
         self._gradients = StepGradients(
             model, self.dynamics, state, self._joint_forces, self._drives, self._arrays, self._passes, self._empty_slots
@@ -276,8 +276,7 @@ class SolverSPO(MassMatrixInterface, SolverBase):
         """Names of the observables.
 
         BODY_PARENT_F is missing if loops are closed, the scene has no dof, or steps have contacts; contact_f and
-        contact_slip are missing if they have none, contact_residual without pairs. Accelerations and BODY_PARENT_F are
-        missing with substeps.
+        contact_slip are missing if they have none. Accelerations and BODY_PARENT_F are missing with substeps.
         """
         return self._observable_arrays.supported
 

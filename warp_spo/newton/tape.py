@@ -134,6 +134,9 @@ class StepGradients:
             if getattr(getattr(observables, kind, None), "requires_grad", False):
                 way_out = "allocate it with solver.observables(..., requires_grad=False)"
                 raise UnsupportedError(CALL, f"the observable {kind!r}, which requires grad", way_out)
+        if self.dynamics.scene.contact_pairs:
+            way_out = "use a solver with contacts='ground', or Dynamics.step with torch tensors, which has gradients"
+            raise UnsupportedError(CALL, "contact between bodies", way_out)
         self.dynamics._gradients.check(STEP)
         if _requires_grad(written, "body_q") or self.forces.turns_with_bodies:
             self.dynamics._gradients.check(BODY_POSES)

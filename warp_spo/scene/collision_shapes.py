@@ -194,9 +194,9 @@ class ShapeSelection(NamedTuple):
             touching, lost = self.body_pairs(between)
             made, words = touched(touching)
             if touching and between is not None:
-                made, turning = self.solvable(between(), made, touching)
+                made, turning = self.solvable(between(), made)
                 words = words + turning
-                why = self.refuse_many(between(), made, touching)
+                why = self.refuse_unsolved(between(), made, touching)
                 if why:
                     made, words = touched([])
                     return made, words + between().missed(why)
@@ -245,33 +245,32 @@ class ShapeSelection(NamedTuple):
             else selection.chosen(self.pairs)
         )
 
-    def solvable(self, selection: PairSelection, made: Scene, pairs: list[ShapePair]) -> tuple[Scene, list[str]]:
+    def solvable(self, selection: PairSelection, made: Scene) -> tuple[Scene, list[str]]:
         """Return the scene without friction against turning on the ground if steps take its pairs then alone.
 
         The second value says in words what is left out.
         """
-        if not selection.reason_against(made, pairs):
+        if not selection.reason_against(made):
             return made, []
         names = [name for name in FRICTIONS[1:] if any(getattr(one, name) for one in made.contacts)]
         none: dict[str, Any] = dict.fromkeys(names, 0.0)
         plain = [dataclasses.replace(one, **none) for one in made.contacts]
         without = made.with_contacts(plain, made.ground)
-        if not names or selection.reason_against(without, pairs):
+        if not names or selection.reason_against(without):
             return made, []
         friction = " and ".join(name.replace("_", " ") for name in names)
         way = "contacts='ground' or a pattern keeps it, without pairs; condim=\"3\" of MJCF says that there is none"
         return without, [f"{friction} of the ground, with which no step takes these pairs of bodies ({way})"]
 
-    def refuse_many(self, selection: PairSelection, made: Scene, pairs: list[ShapePair]) -> str:
+    def refuse_unsolved(self, selection: PairSelection, made: Scene, pairs: list[ShapePair]) -> str:
         """Return why no step takes a scene with such pairs, which nobody asked for; "" if one does.
 
         Raises:
             UnsupportedError: the caller asked for all, or for some that no step takes.
         """
-        listed = self.pairs is not None and not self._takes_all_pairs
-        why = selection.reason_against(made, pairs, listed)
+        why = selection.reason_against(made)
         if why and self.pairs is not None:
-            selection.refuse_many(pairs, why)
+            selection.refuse(pairs, why)
         return why
 
     def wants(self, call: str) -> bool:

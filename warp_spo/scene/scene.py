@@ -20,6 +20,7 @@ from .contact_values import CONTACT_VALUES, contact_values
 from .contacts import Contact, ContactPoint, check_contacts, contact_points
 from .flexible.modes import MASS_VALUES, check_modes, with_modes
 from .ground import HEIGHTS, HeightField, Plane, check_field
+from .labels import fill_labels
 from .pairs import ContactPair, contact_pairs
 from .parts import (
     DOF_VALUES,
@@ -303,13 +304,13 @@ class Scene(Stored):
 
     @property
     def body_labels(self) -> list[str]:
-        """The label of every body; body_k where there is none."""
-        return [body.label or f"body_{k}" for k, body in enumerate(self.bodies)]
+        """The label of every body; body_k where there is none, unless another has it."""
+        return fill_labels((body.label for body in self.bodies), "body")
 
     @property
     def joint_labels(self) -> list[str]:
-        """The label of every hinge; joint_k where there is none."""
-        return [hinge.label or f"joint_{k}" for k, hinge in enumerate(self.hinges)]
+        """The label of every hinge; joint_k where there is none, unless another has it."""
+        return fill_labels((hinge.label for hinge in self.hinges), "joint")
 
     @property
     def dof_labels(self) -> list[str]:

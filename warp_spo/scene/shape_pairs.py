@@ -15,9 +15,6 @@ from .contacts import FRICTIONS, Contact
 if TYPE_CHECKING:
     from .scene import Scene
 
-MOST = 32
-"""Pairs at most that "all" stands for: what compiles in seconds. Nine boxes, 36 pairs, took 11 s on a CPU."""
-CURVED = ("cylinder", "ellipsoid")  # kinds of which steps in joint space alone take pairs
 KINDS = tuple(kind for kind, shape in SHAPES.items() if shape.names and shape.pairs)
 """Kinds of shapes that pairs may have."""
 WAYS = (
@@ -86,7 +83,7 @@ class PairSelection:
         numbers: the shape of each number that a user may give.
         as_pair: returns two shapes with the material that the source gives to their contact.
         takes_still: whether "all" has shapes that stand still, too, but for grounds.
-        why_few: says of a scene with more than MOST pairs why steps take no more, "" if they do; None: they never do.
+        why_unsolved: says of a scene with its pairs why no step takes them, "" if one does; None: it is not asked.
     """
 
     call: str
@@ -96,7 +93,7 @@ class PairSelection:
     numbers: dict[int, CollisionShape]
     as_pair: Callable[[CollisionShape, CollisionShape], ShapePair] = ShapePair
     takes_still: bool = False
-    why_few: Callable[[Scene], str] | None = None
+    why_unsolved: Callable[[Scene], str] | None = None
     _pieces: list[int] = dataclasses.field(init=False)
     _faces: dict[int, int] = dataclasses.field(default_factory=dict, init=False)
     _lacking: dict[int, str] = dataclasses.field(default_factory=dict, init=False)
@@ -117,7 +114,7 @@ class PairSelection:
         Raises:
             TypeError: ``asked`` is neither.
             ValueError: A name or number is of no shape, or two names stand for no pair that may touch.
-            UnsupportedError: No contact represents a listed pair, or "all" are too many.
+            UnsupportedError: No contact represents a listed pair.
         """
         if isinstance(asked, str) and asked == ALL:
             return self._all_pairs()
@@ -143,19 +140,16 @@ class PairSelection:
         sides = (pair for one, other in combinations(trees.values(), 2) for pair in product(one, other))
         return next((ShapePair(*pair) for pair in sides if self.allowed(*pair)), None)
 
-    def reason_against(self, scene: Scene, pairs: Sequence[ShapePair], listed: bool = False) -> str:
-        """Return why steps do not take a scene with such pairs, or so many that are not ``listed``; "" if they do."""
-        curved = any(shape.kind in CURVED for pair in pairs for shape in pair)
-        many = len(pairs) > MOST and not listed
-        return self.why_few(scene) if self.why_few is not None and (curved or many) else ""
+    def reason_against(self, scene: Scene) -> str:
+        """Return why no step takes a scene with its pairs; "" if one does."""
+        return "" if self.why_unsolved is None else self.why_unsolved(scene)
 
     def missed(self, why: str = "") -> list[str]:
         """Return in words that the scene has no contacts of bodies which may touch each other; nothing without any."""
         pairs = self._touching()
         if not pairs:
             return []
-        few = len(pairs) > MOST and (why or self.why_few is None or self.why_few(self.scene))
-        way = "pairs=[...] takes those that matter by names" if few else "pairs='all' takes them"
+        way = "pairs=[...] takes those that matter by names" if why else "pairs='all' takes them"
         such = ShapePair(*sorted(pairs[0], key=self.moves, reverse=True)).words(self.scene.body_labels)
         ways = f"{way}; contacts='ground' or pairs=[] says that there are none"
         because = f", because {why}" if why else ""
@@ -199,18 +193,15 @@ class PairSelection:
                 f"{self.call}: pairs='all' finds no two shapes of bodies that move which may touch{left_out}; "
                 f"expected {', '.join(KINDS)}, and filters of the model that let them collide"
             )
-        if self.why_few is None and len(found) > MOST:
-            self.refuse_many(found)
         return found, lost
 
-    def refuse_many(self, pairs: Sequence[ShapePair], why: str = "") -> NoReturn:
-        """Raise UnsupportedError for more pairs than steps take."""
-        many = f", more than {MOST}" if len(pairs) > MOST else ", some of cylinders or ellipsoids"
+    def refuse(self, pairs: Sequence[ShapePair], why: str) -> NoReturn:
+        """Raise UnsupportedError for pairs that no step takes."""
         raise UnsupportedError(
             self.call,
-            f"contact of {len(pairs)} pairs of shapes{many}{f' ({why})' if why else ''}",
+            f"contact of {len(pairs)} pairs of shapes ({why})",
             "list those that matter, such as pairs=[('cube', '*finger*')], or filter others in the model; "
-            "capsules, boxes and hulls need no joint space",
+            "few pairs of capsules, boxes and hulls need no joint space",
         )
 
     def _representable(self) -> tuple[list[ShapePair], list[str]]:

@@ -45,6 +45,7 @@ def call_with_gradient(
     if refused:
         came, expected = refused.split("; ", 1)
         raise ValueError(f"{call}: {came} and an input requires grad; {expected}; call inside torch.no_grad()")
+    arguments |= derivative.adds(dyn)
     times = derivative.repeats(call, arguments)
     out = arguments.pop("out", None)
     if any(x is not None for x in (out if isinstance(out, tuple | list) else (out,))):
@@ -52,8 +53,8 @@ def call_with_gradient(
             f"{call}: out is given and an input requires grad; expected no out=, because a result with gradients is a "
             f"new tensor; leave out=, or call inside torch.no_grad()"
         )
-    record = Record(dyn, operation, arguments, tuple(inputs), tuple(value_tensors))
     dyn._gradients.check(operation)
+    record = Record(dyn, operation, arguments, tuple(inputs), tuple(value_tensors))
     if times == 1 and not value_tensors:
         given = list(tensors.values())
         dyn._gradients.remember(record, given, written, like(given, exactly=True), _Differentiable.apply)

@@ -402,13 +402,6 @@ def replaces(item: Store) -> bool:
     return old.__class__ is Scalar and old.op == "input" and old.args == (item.array, *item.index)
 
 
-def under(listing: Listing, condition: str, array: str, entry: int) -> Listing:
-    """Return the statements of a listing under a condition, in which ``{}`` stands for an entry of an array."""
-    place = f"{INDEX}{len(listing.indices)}\x04"
-    text = f"if ({condition.format(place)}) {{\n{listing.text}\n}}"
-    return listing._replace(text=text, indices=[*listing.indices, (array, entry)])
-
-
 def fill_in(listing: Listing, constants: list[str], indices: list[str], labels: list[str], prefix: str = "") -> str:
     """Return the statements of a listing with these texts for its placeholders and ``prefix`` before its names."""
     texts = {CONSTANT: constants, INDEX: indices, LABEL: labels}

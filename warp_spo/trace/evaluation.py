@@ -49,7 +49,7 @@ def evaluate(outputs: Iterable[Value], load: Callable[[str, tuple], Any], dtype:
             [entry] or [world, entry].
         dtype: the precision.
     """
-    outputs, values = list(outputs), {}
+    outputs, values, dtype = list(outputs), {}, np.dtype(dtype)
     searches: dict[tuple, np.ndarray] = {}
     for scalar in ordered(outputs):
         if scalar.op == "input":
@@ -85,13 +85,13 @@ def _search(shape: str, cells: np.ndarray | None, asked: np.ndarray) -> np.ndarr
 
     ``cells``: in which it looks, [entry] or [world, entry]; None: it needs none.
     """
-    worlds = asked.reshape(-1, asked.shape[-1])
-    found = (
-        [hull_corners.find(one).ravel() for one in worlds]
-        if cells is None
-        else [
-            field_grid.find(shape, (cells if cells.ndim == 1 else cells[at])[::CORNERS], one).ravel()
-            for at, one in enumerate(worlds)
-        ]
-    )
-    return np.reshape(found, (*asked.shape[:-1], -1))
+    found: dict[tuple, np.ndarray] = {}  # many worlds ask the same, such as copies that differ in velocity alone
+    keys = []
+    for at, one in enumerate(asked.reshape(-1, asked.shape[-1])):
+        heights = None if cells is None else (cells if cells.ndim == 1 else cells[at])[::CORNERS]
+        key = one.tobytes(), None if heights is None else heights.tobytes()
+        if key not in found:
+            answer = hull_corners.find(one) if heights is None else field_grid.find(shape, heights, one)
+            found[key] = answer.ravel()
+        keys.append(key)
+    return np.reshape([found[key] for key in keys], (*asked.shape[:-1], -1))

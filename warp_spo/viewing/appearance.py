@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -107,9 +108,10 @@ def _imported(file: Path, scene: Scene) -> Appearance:
     """Return the shapes that Newton's importer finds in a URDF or USD file; bodies are matched by their labels."""
     import newton
 
-    builder, unit = newton.ModelBuilder(), 1.0
+    builder, unit, missing = newton.ModelBuilder(), 1.0, list[str]()
     if file.suffix.lower() == ".urdf":
-        builder.add_urdf(str(file))
+        text, missing = urdf_with_files(file)
+        builder.add_urdf(text)
     else:
         from pxr import Usd, UsdGeom
 
@@ -118,7 +120,39 @@ def _imported(file: Path, scene: Scene) -> Appearance:
         builder.add_usd(stage, load_sites=False)
     body_of = {label: body for body, label in enumerate(scene.body_labels)}
     rows = {row: body_of[label] for row, label in enumerate(builder.body_label) if label in body_of}
-    return _newton_shapes(builder, rows, unit)
+    found = _newton_shapes(builder, rows, unit)
+    if not missing:
+        return found
+    names = ", ".join(missing[:3]) + f" and {len(missing) - 3} more" * (len(missing) > 3)
+    return found._replace(notes=[*found.notes, f"meshes without a file are not drawn: {names}"])
+
+
+def urdf_with_files(file: Path) -> tuple[str, list[str]]:
+    """Return the text of a URDF whose meshes are paths of files, in metres, and names of meshes without a file.
+
+    Files are found as :func:`warp_spo.load` finds them, which asks no network. What they are missing for is left out.
+    """
+    from ..newton.files.urdf_masses import mesh_file, unit_of
+    from ..newton.files.xml_source import read_xml
+
+    robot, missing = read_xml(file), dict[str, None]()
+    for link in robot.findall("link"):
+        for shape in [*link.findall("visual"), *link.findall("collision")]:
+            found: Any
+            for found in shape.iter("mesh"):
+                try:
+                    path = mesh_file(found, "")
+                except ValueError:
+                    missing[shown(found.get("filename", "").rpartition("/")[2])] = None
+                    link.remove(shape)
+                    break
+                scale = unit_of(found, path) * found.numbers("scale", 3, (1.0, 1.0, 1.0))
+                found.set("filename", str(path))
+                found.set("scale", " ".join(map(repr, scale.tolist())))
+    for material in robot.iter("material"):
+        for texture in material.findall("texture"):  # surfaces have one colour
+            material.remove(texture)
+    return ElementTree.tostring(robot, encoding="unicode"), list(missing)
 
 
 def _newton_shapes(model: Any, rows: dict[int, int], unit: float) -> Appearance:

@@ -23,6 +23,7 @@ SQUARE = 1.0  # edge of the ground's squares [m]
 GROUND_SIZE = 60.0  # edge of the part of a plane that is drawn [m]
 MANY_FACES = 3000  # from which on a surface far away is drawn with fewer
 AZIMUTH, ELEVATION = -1.0, 0.32  # of the first camera, about the vertical from x, and above the horizontal [rad]
+BESIDE = 0.25  # by which what is looked at is left of the picture's middle, beside the panel: a share of its size
 WORLD = "/world"  # what moves against a robot that the page follows
 
 
@@ -72,12 +73,18 @@ class Page:
         self.server.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
         self.scene.configure_environment_map(hdri="warehouse", background=False, environment_intensity=0.35)
         self.root = self.scene.add_frame(WORLD, show_axes=False)
+        self.scene.set_background_image(np.full((2, 2, 3), SKY, np.uint8), format="png")
         self.size, self._ground, self._recorded = size, None, None
         self.look_from(size)
 
-    def look_from(self, size: float, height: float | None = None) -> None:
-        """Put the first camera where something of this size [m], whose middle is at ``height`` [m], fills the view."""
-        target = np.array([0.0, 0.0, 0.4 * size if height is None else height])
+    def look_from(self, size: float, middle: Sequence[float] | np.ndarray | None = None) -> None:
+        """Put the first camera where something of this size [m], whose middle is at ``middle`` [m], fills the view."""
+        self._looked_at = size, np.array([0.0, 0.0, 0.4 * size] if middle is None else middle, np.float64)
+        self._place_camera(BESIDE)
+
+    def _place_camera(self, beside: float) -> None:
+        size, middle = self._looked_at
+        target = middle + beside * size * np.array([-np.sin(AZIMUTH), np.cos(AZIMUTH), 0.0])
         away = 1.6 * size + 0.3
         back = np.array([np.cos(AZIMUTH) * np.cos(ELEVATION), np.sin(AZIMUTH) * np.cos(ELEVATION), np.sin(ELEVATION)])
         camera = self.server.initial_camera
@@ -136,7 +143,8 @@ class Page:
         )  # fmt: skip
 
     def record(self) -> None:
-        """Begin to record what the page shows, for :meth:`as_html`."""
+        """Begin to record what the page shows, for :meth:`as_html`, whose pages have no panel."""
+        self._place_camera(0.0)
         self._recorded = self.server.get_scene_serializer()
 
     def sleep(self, seconds: float) -> None:

@@ -47,6 +47,8 @@ class FailureView:
         low, high = extent(self.appearance, self.poses)
         self.size = max(float(np.linalg.norm(high - low)), 0.05)
         self.page = Page(f"world {failure.world}", host, port, self.size)
+        followed = np.array([*self.poses[0, :2], 0.0]) if floats(self.scene) else 0.0
+        self.page.look_from(self.size, 0.5 * (low + high) - followed)
         self.page.show_ground(self.scene.ground if self.scene.ground is not None else Plane())
         self._layer = BodyLayer(self.page, "bodies", self.appearance.drawn)
         self._arrows, gui = Arrows(self.page, "forces", ORANGE, self.size), self.page.gui

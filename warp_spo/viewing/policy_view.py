@@ -58,10 +58,12 @@ class PolicyView:
         self.env, self.policy, self.checkpoints, self.playing = env, policy, checkpoints, playing
         self.appearance = scene_appearance(env.scene, env.default_q) if appearance is None else appearance
         self.observed, _ = env.reset()
-        low, high = extent(self.appearance, self._all_poses()[0])
+        poses = self._all_poses()[0]
+        low, high = extent(self.appearance, poses)
         self.size = max(float(np.linalg.norm(high - low)), 0.05)
         self.page = Page(title, host, port, self.size)
-        self.page.look_from(self.size * (1.5 if env.num_envs > 1 else 1.0), float(0.5 * (low[2] + high[2])))
+        middle = 0.5 * (low + high) - [*poses[0, :2], 0.0]  # the page follows the first body
+        self.page.look_from(self.size * (1.5 if env.num_envs > 1 else 1.0), middle)
         ground = env.scene.ground
         self.page.show_ground(ground if ground is not None else Plane())
         self.is_field = isinstance(ground, HeightField)
@@ -102,6 +104,8 @@ class PolicyView:
                         low, high = (low, high) if low < high else (low - 1.0, high + 1.0)
                         middle = min(max(0.0, low), high)
                         self.sliders[name] = gui.add_slider(name, low, high, (high - low) / 200, middle)
+                    self.free_button = gui.add_button("Commands as the task draws them")
+                    self.free_button.on_click(lambda _: self._asked.append(self.free))
             with gui.add_folder("Push the followed robot"):
                 self.choices["body"] = gui.add_dropdown("body", [shown(x) for x in env.scene.body_labels])
                 weight = float(env.scene.values["body_mass"][0].sum())
@@ -162,6 +166,11 @@ class PolicyView:
         gained = (dynamics(q, body_f=impulse) - dynamics(q))[0]  # Mass^-1 J* impulse
         self.env.qd[world] += self.env.qd.new_tensor(gained.tolist())
 
+    def free(self) -> None:
+        """Let the task draw the commands again, in all worlds; the sliders show them."""
+        self.env.memory("command held").zero_()
+        self.boxes["steer"].value = False
+
     @property
     def followed(self) -> int:
         """The world that is followed, pushed and steered."""
@@ -208,7 +217,10 @@ class PolicyView:
         return np.array([float(row) for row in rows])
 
     def _steer(self) -> None:
-        """Write the commands' sliders where they have moved, or while all worlds are steered."""
+        """Write what the commands' sliders say where they have moved, or while all worlds are steered.
+
+        Else they show the command of the followed world.
+        """
         if not self.sliders:
             return
         values = [float(slider.value) for slider in self.sliders.values()]
@@ -217,6 +229,12 @@ class PolicyView:
             asked = self.env.q.new_tensor(values)
             self.env.command[slice(None) if every else self.followed] = asked
             self._sent = values
+            return
+        drawn = self.env.command[self.followed].cpu().tolist()
+        for row, (slider, value) in enumerate(zip(self.sliders.values(), drawn, strict=True)):
+            shown_value = min(max(value, slider.min), slider.max)
+            if abs(shown_value - values[row]) > slider.step:
+                slider.value = self._sent[row] = shown_value
 
     def _choose(self) -> None:
         """Load the checkpoint that is chosen, the newest one of its folder for "latest"."""

@@ -26,6 +26,7 @@ from .robot_text import describe_robot
 from .sliders import JointSliders
 
 OWN = "of the file"
+SUNK = 0.02  # depth below z = 0 from which on a plane is put beneath a fixed robot: a share of its size
 FALL = 0.3  # height from which a robot falls [m]
 
 
@@ -34,7 +35,8 @@ class RobotView:
 
     Args:
         scene: the robot. appearance: what its bodies look like. title: of the page. notes: what was left out or warned
-            of, in words. host, port: as of ``Page``.
+            of, in words. host, port: as of ``Page``. own_ground: false where the file has none: a robot whose root is
+            fixed then stands on the plane beneath it.
 
     Attributes:
         page: the ``Page``. q: coordinates that are shown [coordinate]. poses: of the bodies [body, 7].
@@ -44,9 +46,9 @@ class RobotView:
 
     def __init__(
         self, scene: Scene, appearance: Appearance, title: str = "robot", notes: Sequence[str] = (), host: str = HOST,
-        port: int = PORT,
+        port: int = PORT, own_ground: bool = True,
     ):  # fmt: skip
-        self.scene, self.title, self.notes = scene, title, [*notes, *appearance.notes]
+        self.title, self.notes = title, [*notes, *appearance.notes]
         loops = "embed" if scene.constraint_summary else "cut"
         still = scene.with_contacts([])
         try:
@@ -63,8 +65,17 @@ class RobotView:
             self.poses = self._kinematics.body_poses(self.q[None])[0]
             low, high = extent(appearance, self.poses)
         self.size = max(float(np.linalg.norm(high - low)), 0.05)
+        ground = scene.ground if scene.ground is not None else Plane()
+        if not own_ground:
+            beneath = not floats(scene) and low[2] < -SUNK * self.size
+            ground = Plane(float(low[2]) if beneath else 0.0)
+            if scene.contacts:
+                scene = scene.with_contacts(scene.contacts, ground)
+                self.notes.append(f"the file has no ground: the robot stands on the plane z = {ground.height:.3g}")
+        self.scene = scene
         self.page = Page(title, host, port, self.size)
-        self.page.look_from(self.size, float(0.5 * (low[2] + high[2])))
+        self.page.look_from(self.size, 0.5 * (low + high))
+        self._home = self.poses[0, :2].copy()
         self.motion: RobotMotion | None = None
         self.falls, self._steps_due, self._time_due = False, 0, 0.0
         self._pull: Pull | None = None
@@ -75,8 +86,8 @@ class RobotView:
         }
         self.overlays = Overlays(self.page, scene, self.size)
         self.arrows = Arrows(self.page, "forces", ORANGE, self.size)
-        self._ground_name, self._moving_scene = OWN, scene
-        self.page.show_ground(scene.ground if scene.ground is not None else Plane())
+        self._ground_name, self._own_ground = OWN, ground
+        self.page.show_ground(ground)
         self.boxes: dict[str, Any] = {}
         self._asked: collections.deque[Callable[[], None]] = (
             collections.deque()
@@ -102,7 +113,7 @@ class RobotView:
             for name in self.overlays.names:
                 self.boxes[name] = gui.add_checkbox(name, False)
             self.boxes["contact forces"] = gui.add_checkbox("contact forces", True)
-            self.boxes["follow"] = gui.add_checkbox("follow the robot", True)
+            self.boxes["follow"] = gui.add_checkbox("follow the robot", len(moving_trees(self.scene)) == 1)
         with tabs.add_tab("Drop it"):
             self.buttons = gui.add_button_group("motion", ("Drop it", "Pause", "Step", "Back"))
             self.ground = gui.add_dropdown("ground", [OWN, *GROUNDS], initial_value=OWN)
@@ -170,12 +181,12 @@ class RobotView:
         name = self.ground.value
         if self.motion is None or name != self._ground_name:
             self._ground_name, scene = name, self.scene
-            ground = make_ground(name, scene.ground)
+            ground = make_ground(name, self._own_ground)
             if scene.contacts and name != OWN:
                 scene = scene.with_contacts(scene.contacts, ground)
             self.said.content = "The time step is compiled, once for this robot and ground ..."
             self.motion = RobotMotion(scene)
-            self.page.show_ground(ground if ground is not None else Plane())
+            self.page.show_ground(ground)
         q = self.sliders.q.copy()
         if floats(self.scene):
             q[2] += float(self.numbers["height"].value)
@@ -282,7 +293,7 @@ class RobotView:
             layer.place(self.poses[None])
         self.overlays.place(self.poses)
         if self.boxes["follow"].value and floats(self.scene) and self.motion is not None:
-            self.page.follow(self.poses[0])
+            self.page.follow(self.poses[0, :2] - self._home)
         elif self.motion is None:
             self.page.follow((0.0, 0.0))
 
@@ -337,8 +348,8 @@ def view(robot: Any, host: str = HOST, port: int = PORT, contacts: Any = None, *
         return RobotView(robot, scene_appearance(robot), "scene", host=host, port=port)
     if isinstance(robot, str | Path):
         file = Path(robot)
-        scene, notes = load_with_notes(file, contacts, options)
-        return RobotView(scene, file_appearance(file, scene), file.name, notes, host, port)
+        scene, notes, has_ground = load_with_notes(file, contacts, options)
+        return RobotView(scene, file_appearance(file, scene), file.name, notes, host, port, has_ground)
     from ..newton import from_newton
 
     with warnings.catch_warnings(record=True) as caught:
@@ -350,11 +361,14 @@ def view(robot: Any, host: str = HOST, port: int = PORT, contacts: Any = None, *
     return RobotView(scene, model_appearance(robot, scene), "model", notes, host, port)
 
 
-def load_with_notes(file: Path, contacts: Any, options: dict[str, Any]) -> tuple[Scene, list[str]]:
-    """Return the scene of a file, on a plane if the file has no ground, and the warnings of its loader."""
+def load_with_notes(file: Path, contacts: Any, options: dict[str, Any]) -> tuple[Scene, list[str], bool]:
+    """Return the scene of a file, the warnings of its loader, and whether its ground is one that somebody chose.
+
+    That of a URDF, which has none, is the plane z = 0, unless ``options`` have another.
+    """
     from ..newton import load
 
-    notes: list[str] = []
+    notes, chosen = list[str](), file.suffix.lower() != ".urdf" or "ground" in options
 
     def read(contacts: Any) -> Scene:
         with warnings.catch_warnings(record=True) as caught:
@@ -370,14 +384,5 @@ def load_with_notes(file: Path, contacts: Any, options: dict[str, Any]) -> tuple
     except (ValueError, ImportError) as error:  # of a shape; without contacts the file may do
         refusal = str(error)
         scene = read(None)
-        return scene, [*notes, f"no contacts: {refusal}"]
-    if contacts is None:
-        contacts = True if len(moving_trees(scene)) > 1 else "ground"
-    if scene.ground is not None or "ground" in options:
-        return scene, notes
-    try:
-        options = options | {"ground": Plane()}
-        scene = read(contacts)
-    except ValueError:
-        return scene, notes
-    return scene, [*notes, *["the file has no ground: it stands on the plane z = 0"] * bool(scene.contacts)]
+        return scene, [*notes, f"no contacts: {refusal}"], chosen
+    return scene, notes, chosen

@@ -9,8 +9,7 @@ import warp as wp
 from ...errors import UnsupportedError, as_integer
 from ...kernels import combination
 from ...recursions.contact import step as contact_step
-from ...recursions.contact.pair_pieces import by_limbs
-from ...recursions.contact.pairs import RESIDUAL, default_passes
+from ...recursions.contact.pairs import default_passes
 from ...recursions.contact.turning import turning_names
 from ...runtime.arrays import Call
 from ...scene.contact_values import contact_figures
@@ -18,16 +17,17 @@ from ...scene.ground import HeightField
 from ..closures import AMID_CONTACTS
 from ..operation import Argument
 from . import integrators
-from .joint_space import NO_ROOM, reason_against
+from .joint_space import reason_against
 
 if TYPE_CHECKING:
     from ..dynamics import Dynamics
 
-REPORTS = (*contact_step.REPORTS, RESIDUAL)
-AXES = ("world, contact, 3", "world, contact", "world, contact", "world, 3", "world, contact, 3", "world")
+REPORTS = contact_step.REPORTS
+AXES = ("world, contact, 3", "world, contact", "world, contact", "world, 3", "world, contact, 3")
 ARGUMENTS = tuple(
     Argument(name, axes, optional=True, asked=True, written=True) for name, axes in zip(REPORTS, AXES, strict=True)
 )
+FEW_TIED = "generated code: few links are tied, and it eliminates them"
 MOST_HEIGHTS = {"float32": 2**24, "float64": 2**31}  # points of a field whose numbers the dtype tells apart
 
 
@@ -42,10 +42,6 @@ def check_step(dyn: Dynamics, call: Call, integrator: str, passes: Any, asked: d
             if value is not None:
                 raise ValueError(f"{call.name}: {name} is given, and the scene has no contacts; expected None")
         return None
-    if asked[RESIDUAL] is not None and not dyn.scene.contact_pairs:
-        raise ValueError(
-            f"{call.name}: {RESIDUAL} is given, and no bodies of the scene touch each other; expected None"
-        )
     if asked["contact_moment"] is not None and not turns(dyn):
         raise ValueError(
             f"{call.name}: contact_moment is given, and no contact has torsional or rolling friction; expected None"
@@ -93,14 +89,9 @@ def refuse(dyn: Dynamics, call: Call, integrator: str) -> None:
         raise UnsupportedError(call.name, "closing loops in a scene with contacts", AMID_CONTACTS)
     if forced == "node":
         raise UnsupportedError(call.name, f"granularity={forced!r} with contacts", "use another one, or leave it out")
-    apart = bool(dyn.scene.contact_pairs) and dyn._joint_space is None  # no solver of its own, whatever the granularity
-    if apart and any(shape.is_curved for pair in dyn.scene.contact_pairs for shape in pair.shapes):
-        why = reason_against(dyn.scene, dyn.variable) or NO_ROOM
-        what = f"cylinders and ellipsoids in contact with other bodies ({why})"
-        raise UnsupportedError(call.name, what, "give capsules, boxes or hulls in their place")
-    if forced == "segment" and apart and not by_limbs(dyn.scene):
-        what = "granularity='segment' where pairs of bodies are not all on limbs of one link, or more than eight"
-        raise UnsupportedError(call.name, what, "leave it out")
+    lacks, way = reason_against(dyn)
+    if lacks:
+        raise UnsupportedError(call.name, f"contact between bodies in a scene with {lacks}", way)
     if isinstance(dyn.scene.ground, HeightField) and dyn.scene.ground.heights.size >= MOST_HEIGHTS[dyn.dtype.__name__]:
         way = "use dtype='float64', or a coarser field"
         raise UnsupportedError(call.name, f"a HeightField of {dyn.scene.ground.heights.size} points in float32", way)
@@ -127,5 +118,6 @@ def explain(dyn: Dynamics) -> str:
         held = dyn.programs.warps(routine) != 1  # 1: a kernel was built, and limbs found no room in it
         form = "a warp for each limb" if held else f"{form}: what limbs tell each other does not fit in shared memory"
     if dyn.scene.contact_pairs:
-        form += f"; pairs of bodies by generated code: {reason_against(dyn.scene, dyn.variable) or NO_ROOM}"
+        lacks, _ = reason_against(dyn)
+        form += f"; no step takes pairs of bodies beside {lacks}" if lacks else f"; pairs of bodies by {FEW_TIED}"
     return f"{figures}; {passes}; {form}"

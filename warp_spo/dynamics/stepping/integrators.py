@@ -12,7 +12,7 @@ from ...execution.routine import PassForm, Routine, SegmentForm
 from ...kernels import combination, loops
 from ...kernels.substeps import SUBSTEPS
 from ...recursions import coordinates, kinematics
-from ...recursions.contact import pair_pieces, pairs
+from ...recursions.contact import coupled, pairs
 from ...recursions.loops import closed_step, multipliers
 from ...recursions.loops.closed_step import NEWTON_STEPS
 from ...recursions.step import hinge_forces
@@ -39,22 +39,13 @@ def _divides(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
     return recursion.by_segments(scene)
 
 
-def _limbs_couple(scene: Scene, inputs: Iterable[str], **_: Any) -> bool:
-    return pair_pieces.by_limbs(scene)
-
-
 STEP = Routine(
     "step", recursion.step, segments=SegmentForm(messages="PzaSX", divides=_divides, wide=True), passes=PassForm()
 )
 BODIES_BY_KINEMATICS = Routine(
     "body_states", kinematics.body_states, segments=SegmentForm(wide=True, body_kinematics=True), passes=PassForm()
 )
-PAIRED_STEP = Routine(
-    "paired_step",
-    pair_pieces.step,
-    segments=SegmentForm(messages="PzafSE", divides=_limbs_couple, wide=True, couples_bodies=True),
-    passes=PassForm(counted=True),
-)
+PAIRED_STEP = Routine("paired_step", coupled.step, passes=PassForm(counted=True))
 EMBEDDED_STEP = Routine("step", closed_step.step, passes=PassForm())
 STEP_UNDER_MULTIPLIERS = Routine("step", closed_step.step_with_multipliers, passes=PassForm())
 STEP_SYSTEM = Routine("step_system", closed_step.step_system)
@@ -90,6 +81,7 @@ def semi_implicit(
     passes: int | None = None,
     rounds: int | None = None,
     substeps: int = 1,
+    joint_space: bool = False,
     **given: Any,
 ) -> None:
     """Launch the implicit step of order 1.
@@ -98,6 +90,7 @@ def semi_implicit(
         qdd, status: arrays to fill, see :meth:`Dynamics.step`; reports: others, by name. bodies: arrays for poses and
             velocities of the bodies after the step. passes: of scenes with contacts. rounds: of the midpoint scheme.
         substeps: more than one only where :func:`several_launches` names no reason against it.
+        joint_space: solve pairs of bodies in joint space, even where generated code is chosen: for the way back.
         given: forces and targets by name. With ``q_from``, ``qd_from`` the step starts from that state, while its sweep
             and the laws of its joints are evaluated at q, qd.
     """
@@ -110,9 +103,10 @@ def semi_implicit(
     given |= {SUBSTEPS: float(substeps)} if substeps > 1 else {}
     if dyn.scene.contacts:
         count = float(pairs.default_passes(dyn.scene) if passes is None else passes)
-        if dyn._joint_space is not None:
+        solver = dyn._joint_gradients.solver if joint_space else dyn._joint_space
+        if solver is not None:
             asks = {name.removesuffix("_out"): array for name, array in asked.items()} | (reports or {})
-            dyn._joint_space.launch(q, qd, (q_out, qd_out), dt, int(count), asks, **given)
+            solver.launch(q, qd, (q_out, qd_out), dt, int(count), asks, **given)
             if bodies is not None:
                 write_bodies(dyn, q_out, qd_out, bodies)
             return

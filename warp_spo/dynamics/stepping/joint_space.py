@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import warp as wp
 
-from ...execution.joint_tables import joint_tables, lacking, motor_laws
+from ...execution.joint_tables import joint_tables, lacking, motor_laws, way_out
 from ...execution.routine import Routine
 from ...kernels import convex_pairs, joint_space, near_pairs
 from ...recursions.contact import coupled, joint_system
-from ...recursions.contact.pairs import PASSES, RESIDUAL
+from ...recursions.contact.pairs import PASSES
 from ...recursions.contact.points import surface_numbers
 from ...recursions.contact.step import TOLERANCE
-from ...recursions.model.links import Links
 from ...runtime import launches
 from ...scene.contact_shapes import BOX, CYLINDER, ELLIPSOID, SWEPT_SEGMENT, ConvexShape
 from ...scene.ground import HEIGHTS
@@ -34,7 +33,8 @@ FEW, MOST_SHARED = 8192, 96 * 1024
 ROOM = 227 * 1024  # shared memory of a block [bytes]
 MARGIN = 5e-3  # how near shapes are looked at whatever their speeds [m]; a drive at 1000 m/s^2 moves so far in 3 ms
 TINY = 1e-9  # radius of a point among shapes [m]
-NO_ROOM = "a world in joint space is larger than the shared memory of a block"
+NO_ROOM = "more dofs and contacts than the shared memory of the GPU holds of a world"
+NO_ROOM_WAY = "use dtype='float32', or list fewer pairs"
 NEAR, NEAR_A_BODY = 256, 4
 """Pairs that may be near in a world: so many, or so many for each body of a pair. One takes 240 bytes in float32."""
 FULL, LEAST, LEAST_A_BODY = 8, 16, 2
@@ -42,22 +42,35 @@ FULL, LEAST, LEAST_A_BODY = 8, 16, 2
 two others, mostly with four points. Where shared memory is short, LEAST slots, or LEAST_A_BODY for each body, stay."""
 
 
-def reason_against(scene: Scene, variable: tuple[str, ...]) -> str:
-    """Return why the pairs of a scene are not solved in joint space; "" if they are."""
-    if scene.dof_count == 0:
-        return "nothing can move"
-    if coupled.is_supported(Links(scene)):
-        return "few links are tied, and generated code eliminates them"
-    lacks = lacking(scene, variable)
-    return f"{lacks} have no solution in joint space" if lacks else ""
+def is_generated(dyn: Dynamics) -> bool:
+    """Return whether generated code solves the pairs of bodies: they tie few links, or nothing can move."""
+    return dyn.scene.dof_count == 0 or coupled.is_supported(dyn.programs.builder.links)
 
 
 def choose_solver(dyn: Dynamics) -> JointSpaceStep | None:
-    """Return the solver of the pairs of bodies; None where there are none, or generated code solves them."""
-    if not dyn.scene.contact_pairs or reason_against(dyn.scene, dyn.variable):
+    """Return the solver of the pairs of bodies; None where there are none, generated code solves them, or no step."""
+    if not dyn.scene.contact_pairs or is_generated(dyn) or lacking(dyn.scene, dyn.variable):
         return None
     solver = JointSpaceStep(dyn)
     return solver if solver.fits else None
+
+
+def reason_against(dyn: Dynamics) -> tuple[str, str]:
+    """Return what of a scene keeps all steps from taking its pairs of bodies, and the way out; "" twice if one does."""
+    if not dyn.scene.contact_pairs or dyn._joint_space is not None or is_generated(dyn):
+        return "", ""
+    lacks = lacking(dyn.scene, dyn.variable)
+    return (lacks, way_out(lacks)) if lacks else (NO_ROOM, NO_ROOM_WAY)
+
+
+def reason_against_gradients(scene: Scene, variable: tuple[str, ...]) -> str:
+    """Return why steps of a scene whose bodies touch have no gradients; "" if they have."""
+    if scene.dof_count == 0:
+        return "nothing can move"
+    lacks = lacking(scene, variable)
+    if lacks:
+        return f"{lacks} have no solution in joint space"
+    return "anchors vary" if {"joint_X_p", "joint_X_c"} & set(variable) else ""
 
 
 def choose_slots(scene: Scene) -> tuple[int, int]:
@@ -183,12 +196,14 @@ class JointSpaceStep:
                 sides.append([*at, *shape.pose[3:], *sizes, *com, float(np.linalg.norm(at - com)) + ball, ball])
         assert not sides or len(sides[0]) == len(near_pairs.SIDE)
         self.which, self.sides = array(np.ravel(which), dtype=int), array(np.ravel(sides))
-        routines = rows.routines([which[i][1::2] + which[i + 1][1::2] for i in range(0, len(which), 2)])
+        self.routines = rows.routines([which[i][1::2] + which[i + 1][1::2] for i in range(0, len(which), 2)])
         kinds = [array(np.ravel(rows.rows), dtype=int), array(rows.sizes)]
         kinds += [array(np.ravel(each)) for each in (rows.corners, rows.planes)]
         self.shapes = kinds + [array(each, dtype=int) for each in (rows.starts, rows.loops)]
         kernels = near_pairs.narrow, near_pairs.passing
-        self.narrow, self.passing = (each(self.tables.sizes.pairs, self.near_count, T, routines) for each in kernels)
+        self.narrow, self.passing = (
+            each(self.tables.sizes.pairs, self.near_count, T, self.routines) for each in kernels
+        )
 
     def _launch(self, kernel: Any, threads: int, inputs: list, outputs: list, block: int = 64) -> None:
         launches.launch(kernel, threads, [self.worlds, *inputs], outputs, device=self.device, block_dim=block)
@@ -287,9 +302,8 @@ class JointSpaceStep:
         ctrl: wp.array | None = None,
     ) -> None:
         """Launch the step of :meth:`Dynamics.step`; ``after``: arrays for q and qd, ``reports``: others by name."""
-        for name in (RESIDUAL, "contact_moment"):
-            if name in reports:
-                launches.fill(reports[name], 0)
+        if "contact_moment" in reports:
+            launches.fill(reports["contact_moment"], 0)
         renamed = {"contact_excess": "excess"}
         results = {renamed.get(name, name): array for name, array in reports.items()}
         self.step(q, qd, tau, (target_q, target_qd), dt, passes, after, body_f, ctrl, results)

@@ -80,8 +80,6 @@ class StepReport(Mapping[str, Any]):
               the largest pull of a contact [N], and the largest force of a drive beyond its effort limit [N m or N].
             * ``contact_moment``: of a scene with torsional or rolling friction, its moment on the body of each contact
               point [world, contact, 3] [N m], inertial axes; zero for pairs.
-            * ``contact_residual``: of a scene with pairs of bodies, the largest change of a pair's force in the last of
-              16 rounds, where pairs are solved in rounds [world] [N]; zero where they are solved exactly.
 
     Raises:
         ValueError: there is no such report.

@@ -39,8 +39,9 @@ from ..operation import (
     required,
 )
 from ..trial_inputs import rotations
-from . import contact_gradients, contact_options, integrators
+from . import contact_gradients, contact_options, integrators, joint_space_gradients
 from .integrators import INTEGRATORS, StepArrays
+from .joint_space import reason_against_gradients
 from .midpoint_contact import INTEGRATE_VJP
 from .options import OPTIONS, REPORT, REPORTS, StepOptions, StepReport, check_names
 
@@ -83,6 +84,11 @@ def _launch_gradients(
 
     Without contacts and embedded loops, tau is left out: that gradient reads qdd of the step instead.
     """
+    if dyn.scene.contact_pairs:
+        wrt, passes = given.pop("wrt"), given.pop("passes", None)
+        results = dict(zip(wrt, (out, *more.values()), strict=True))
+        dyn._joint_gradients.launch(results, passes, **given)
+        return
     if dyn.scene.contacts:
         contact_gradients.launch(dyn, out, more, **given)
         return
@@ -101,6 +107,11 @@ def _without_gradient(dyn: Dynamics, arguments: dict[str, Any]) -> str:
         return "actuators delay ctrl; expected a scene without delays, whose buffers have no gradients"
     if arguments.get("rounds") and not dyn.scene.contacts:
         return f"rounds is {arguments['rounds']} without contacts; expected rounds=None, which has gradients"
+    if dyn.scene.contact_pairs:
+        known = ", ".join(joint_space_gradients.VALUES)
+        for name, tensor in dyn.values.tensors.items():
+            if name in DIFFERENTIABLE and name not in joint_space_gradients.VALUES and tensor.requires_grad:
+                return f"{name} requires grad where bodies touch each other; expected of values {known} alone there"
     for name in ("status", *integrators.BODIES, *contact_options.REPORTS):
         if arguments.get(name) is not None and arguments.get("substeps", 1) != 1:
             return f"{name} is given with substeps; expected one of the two"
@@ -112,7 +123,13 @@ def _without_gradient(dyn: Dynamics, arguments: dict[str, Any]) -> str:
 def _lacking(links: Links) -> str:
     """Return what of a scene has no gradient, and the way out; "" if nothing."""
     way = "leave out contacts with other=, as those with the ground have gradients, or call inside torch.no_grad()"
-    return f"contact between bodies; {way}" if links.scene.contact_pairs else ""
+    why = reason_against_gradients(links.scene, tuple(links.variable)) if links.scene.contact_pairs else ""
+    return f"contact between bodies ({why}); {way}" if why else ""
+
+
+def _solve_in_joint_space(dyn: Dynamics) -> dict[str, Any]:
+    """Return the option of a step that has a way back: bodies that touch are solved in joint space there."""
+    return {"joint_space": True} if dyn.scene.contact_pairs else {}
 
 
 def _take_substeps(call: str, arguments: dict[str, Any]) -> int:
@@ -141,6 +158,7 @@ STEP = Operation(
         Option("substeps", default=lambda scene: 1),
         Option("passes", default=lambda scene: None),
         Option("rounds", default=lambda scene: None),
+        Option("joint_space", default=lambda scene: None, asked=False),
         *REPORTS,
     ),
     bundles=(OPTIONS, REPORT),
@@ -159,6 +177,7 @@ STEP = Operation(
         pull=_pull_back_step,
         launch=_launch_gradients,
         refuses=_without_gradient,
+        adds=_solve_in_joint_space,
         repeats=_take_substeps,
         lacking=_lacking,
     ),
@@ -182,6 +201,7 @@ def _step(
     substeps: int = 1,
     passes: int | None = None,
     rounds: int | None = None,
+    joint_space: bool | None = None,
     qdd: AnyArray | None = None,
     poses: AnyArray | None = None,
     velocities: AnyArray | None = None,
@@ -190,7 +210,6 @@ def _step(
     contact_slip: AnyArray | None = None,
     contact_excess: AnyArray | None = None,
     contact_moment: AnyArray | None = None,
-    contact_residual: AnyArray | None = None,
     out: tuple[ArrayT | None, ArrayT | None] = (None, None),
 ) -> tuple[ArrayT, ArrayT]:
     """Launch a step. The arguments are those of :func:`step`, with options and reports by their own names."""
@@ -199,7 +218,7 @@ def _step(
         integrators.check_integrator(call, integrator, status=status, qdd=qdd)
         outs = engine.outs(call, STEP, out)
         substep_count = _take_substeps(call.name, {"substeps": substeps})
-        reported = contact_f, contact_gap, contact_slip, contact_excess, contact_moment, contact_residual
+        reported = contact_f, contact_gap, contact_slip, contact_excess, contact_moment
         report_arrays = dict(zip(contact_options.REPORTS, reported, strict=True))
         passes_made = contact_options.check_step(self, call, integrator, passes, report_arrays)
         actuators.check_commands(self, call, ctrl, actuator_state, target_q)
@@ -214,6 +233,7 @@ def _step(
         rounds_made = contact_options.check_rounds(self, call, integrator, rounds)
         given |= {"rounds": rounds_made} if passes_made is not None or rounds_made else {}
         given |= {} if passes_made is None else {"passes": passes_made, "reports": reports}
+        given |= {"joint_space": True} if joint_space else {}
         given["bodies"] = integrators.arrays_of_bodies(self, states) if states else None
         q_out, qd_out = engine.write(call, STEP, outs, given)
         interval = StepArrays(given["q"], given["qd"], q_out, qd_out, given["dt"])

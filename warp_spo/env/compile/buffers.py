@@ -129,7 +129,7 @@ class Storage:
             self._initial[name] = self._initial["q"]
         for number, (joints, slots) in enumerate(layout.networks):
             if slots:
-                self._add(ring_name(number), self._zeros(2 * slots, self.worlds, joints), COLUMN)
+                self._add(ring_name(number), self._zeros(2 * slots * joints, self.worlds), COLUMN)
         if "actuator_force" in read:
             self._add("actuator_force", self._zeros(self.worlds, layout.scene.dof_count))
 

@@ -1,7 +1,6 @@
 """Programs at segment granularity: a block computes 32 worlds, a warp one segment of each.
 
-Segments of equal structure run one text, in which what differs is read from a table. Without room for what segments
-tell each other, or with pairs of bodies that one node holds, one thread can run the work of all segments (``alone``).
+Segments of equal structure run one text, in which what differs is read from a table.
 """
 
 from __future__ import annotations
@@ -10,12 +9,9 @@ from typing import NamedTuple
 
 import warp as wp
 
-from ...kernels import coupling_teams
 from ...kernels.elementary import C_TYPE
 from ...kernels.long_results import WARP_SIZE
 from ...kernels.straight_line import DIRECT, KernelLayout
-from ...recursions.contact import pair_pieces
-from ...recursions.contact.couples import Team as Couplings
 from ...recursions.contact.points import own_points
 from ...recursions.contact.secant_laws import SECANT
 from ...recursions.model import messages, shared_constants
@@ -25,7 +21,7 @@ from ...recursions.model.segments import Segment, Segments
 from ...recursions.model.tracing import Trace
 from ...recursions.step.phases import StepPhases, as_phases
 from ...recursions.step.step import FORCE, GAIN, GUESS, MISSED, RESISTANCE
-from ...trace.emission import Emitter, Store, under
+from ...trace.emission import Emitter, Store
 from ...trace.register_spilling import spill_registers
 from ...trace.scalars import Scalar, Value, is_literal, negative, ordered
 from .. import staging
@@ -45,48 +41,37 @@ class SegmentTrace(NamedTuple):
 
     Attributes:
         phases: what its evaluation stores.
-        couples, carried: of the code that couples bodies, as of a :class:`~warp_spo.recursions.model.tracing.Trace`.
         constants: its constants, where they may be kept from folding.
     """
 
     phases: StepPhases
-    couples: list[tuple[int, list[Store]]]
-    kept_between_sweeps: list[Value]
-    constants: shared_constants.SharedConstants | None
-
-    @property
-    def everything(self) -> list[Store]:
-        """All stores of a segment."""
-        return [*self.phases.everything, *(item for _, items in self.couples for item in items)]
+    constants: shared_constants.SharedConstants
 
 
 class SegmentsCode(NamedTuple):
     """The work of all segments before it is one text.
 
     Attributes:
-        table: which value each entry of the result receives, if a table says so. sent: how many scalars segments send.
-        looks_up: some segment reads heights. couples: the pairs of bodies. constants: those of each segment.
+        table: which value each entry of the result receives, if a table says so.
+        looks_up: some segment reads heights. constants: those of each segment.
     """
 
     kernel: WarpSpecializedKernel
     layout: KernelLayout
     table: list[int] | None
-    sent: int
     looks_up: bool
-    couples: Couplings | None
     constants: list[shared_constants.SharedConstants]
 
 
-def build(builder: Builder, job: Job, segments: Segments, alone: bool = False, local: bool = False) -> Program | None:
+def build(builder: Builder, job: Job, segments: Segments) -> Program | None:
     """Return the program in which segments share the work, None if there is no room.
 
     Args:
         builder: the parts that all programs share.
         job: what the program computes.
         segments: the segments.
-        alone: one thread takes them all. local: it keeps what they tell each other in memory of its own.
     """
-    return _SegmentProgram(builder, job, segments, alone, local).build()
+    return _SegmentProgram(builder, job, segments).build()
 
 
 class _SegmentProgram:
@@ -94,56 +79,42 @@ class _SegmentProgram:
 
     Args:
         builder: the parts that all programs share. job: the routine, and the arrays and options that it is built for.
-        segments: of the scene. alone: one thread takes all segments, one after the other.
-        local: that thread keeps their messages in its own memory, where warps use shared memory.
+        segments: of the scene.
 
     Attributes:
         letters: of the messages that are sent, see :mod:`~warp_spo.recursions.model.messages`.
-        offsets: where each message begins. sent: how many scalars all messages have, with those of couples of bodies.
+        offsets: where each message begins. sent: how many scalars all messages have.
     """
 
-    def __init__(self, builder: Builder, job: Job, segments: Segments, alone: bool, local: bool):
-        self.builder, self.job, self.segments, self.alone, self.local = builder, job, segments, alone, local
+    def __init__(self, builder: Builder, job: Job, segments: Segments):
+        self.builder, self.job, self.segments = builder, job, segments
         self.run, self.plan, self.dtype = builder.run, builder.plan, builder.dtype
         self.schedule = Schedule(segments)
         assert job.routine.segments is not None
         self.form = job.routine.segments
         self.letters = messages.select_sent(self.form.messages, job.shapes)
         self.offsets, self.sent = messages.offsets(self.letters, segments)
-        self.couples = self._couples() if self.form.couples_bodies else None
-        self.sent = self.couples.layout["end"] if self.couples is not None else self.sent
-        self.may_keep_constants = not self.form.couples_bodies  # from folding, those in which segments differ
 
     def build(self) -> Program | None:
         """Return the program; of two, with constants that fold and with some that do not, that with fewer texts."""
         found = self._gather([frozenset()] * len(self.segments.all))
-        if found is not None and self.may_keep_constants:
+        if found is not None:
             unfolded = shared_constants.find_differing(self.segments.all, found.constants, found.kernel.texts)
             other = self._gather(unfolded) if any(unfolded) else None
             if other is not None and len(set(other.kernel.texts)) < len(set(found.kernel.texts)):
                 found = other
         return None if found is None else self._finish(found)
 
-    def _couples(self) -> Couplings:
-        """Return the pairs of bodies as a team couples them; their values follow those of messages."""
-        links = self.builder.links
-        seats = pair_pieces.seats_of(links, segments := Segments(links))
-        alpha = -1 if seats is None or seats.base is None else self.offsets["a", seats.base.index]
-        warps = [assigned.warp for assigned in self.schedule.assignments]
-        return pair_pieces.team(links, segments, alpha, self.sent, warps)
-
     # -- the work of each segment ------------------------------------------------------------------------------------
     def _trace(self, index: int, unfolded: frozenset) -> SegmentTrace:
         """Return what the work on a segment stores; the constants ``unfolded`` do not fold, see
         :mod:`.shared_constants`."""
         shapes, options = self.job.shapes, self.job.options
-        links = self.builder.own_links(options, self.may_keep_constants)  # its own: equal segments then give equal text
+        links = self.builder.own_links(options, True)  # its own: equal segments then give equal text
         exchange = SegmentExchange(links, index, self.offsets, self.segments.distinct_dof_count > MOST_LAWS)
         trace = Trace(links, self.dtype, tuple(shapes), exchange)
-        trace.team = self.couples
-        if self.may_keep_constants:
-            points = [number for number, _ in own_points(trace)]
-            links.shared_constants = shared_constants.SharedConstants(links.graph, exchange.segment, points, unfolded)
+        points = [number for number, _ in own_points(trace)]
+        links.shared_constants = shared_constants.SharedConstants(links.graph, exchange.segment, points, unfolded)
 
         def flat(items: list[Store]) -> list[Store]:
             return [flatten(item, shapes) for item in items]
@@ -155,41 +126,32 @@ class _SegmentProgram:
             final_messages=flat(phases.final_messages),
             final_stores=[flat(group) for group in phases.final_stores],
         )
-        found = SegmentTrace(
-            phases,
-            trace.couples,
-            trace.kept_between_sweeps,
-            links.shared_constants if self.may_keep_constants else None,
-        )
-        used = _read(phases.pass_invariants, found.everything[len(phases.prologue) :])
-        return found._replace(phases=phases._replace(pass_invariants=used))
+        used = _read(phases.pass_invariants, phases.everything[len(phases.prologue) :])
+        return SegmentTrace(phases._replace(pass_invariants=used), links.shared_constants)
 
     def _gather(self, unfolded: list[frozenset]) -> SegmentsCode | None:
         """Return the work of all segments, None if there is no room; ``unfolded``: by segment, see :meth:`_trace`."""
         job, segments, schedule = self.job, self.segments, self.schedule
         routine = job.routine
         traced = [self._trace(index, unfolded[index]) for index in range(len(segments.all))]
-        everything = [item for one in traced for item in one.everything]
+        everything = [item for one in traced for item in one.phases.everything]
         guesses = any(item.array == MISSED for item in everything)
         if not (guesses or routine.is_counted):
             traced = [one._replace(phases=one.phases._replace(pass_invariants=[])) for one in traced]
         passes = self._make_pass_loop(traced, guesses)
         sent = self.sent + (2 * schedule.warps if guesses else 0)
         whole = [item for item in everything if item.array == "out"]
-        warps = 1 if self.alone else schedule.warps
-        layout = self.builder.layout(job, whole, everything, 0 if self.local else sent, warps)
+        layout = self.builder.layout(job, whole, everything, sent, schedule.warps)
         if not self._fits(layout):
             return None
-        declared = "" if self.couples is None else coupling_teams.declare(self.couples, self.run.dtype, self.local)
-        kernel = WarpSpecializedKernel(schedule, self.dtype, passes, declared)
+        kernel = WarpSpecializedKernel(schedule, self.dtype, passes)
         outs = [[item for item in one.phases.sweep if item.array == "out"] for one in traced]
         placed, table = staging.arrange_stores(whole, layout.result)
         outs[0] += placed[len(whole) :] if table is None else []  # zeros
         looks_up = False
         for segment, one, items in zip(segments.all, traced, outs, strict=True):
             looks_up |= self._add_work(kernel, layout, table, segment, one, items)
-        constants = [one.constants for one in traced if one.constants is not None]
-        return SegmentsCode(kernel, layout, table, sent, looks_up, self.couples, constants)
+        return SegmentsCode(kernel, layout, table, looks_up, [one.constants for one in traced])
 
     def _make_pass_loop(self, traced: list[SegmentTrace], guesses: bool) -> PassLoop | None:
         """Return the loop over passes and what each segment keeps from pass to pass; None where there are no passes.
@@ -214,7 +176,7 @@ class _SegmentProgram:
         form, options = self.form, self.job.options
         if layout.result.way == DIRECT and layout.result.array.entries > staging.LONG_ROW:
             return False
-        if not layout.fits(self.run.dtype, self.builder.room(form.wide, form.couples_bodies, BODIES in options)):
+        if not layout.fits(self.run.dtype, self.builder.room(form.wide, BODIES in options)):
             return False
         return not options.get(BODIES) or bool(layout.further_staged)
 
@@ -248,9 +210,7 @@ class _SegmentProgram:
         last = outward if set(self.letters) & set(messages.OUTWARD_LETTERS) else inward
         last += by_slot(outs)
         last += [item for item in phases.sweep if item.array in (*more, GAIN, SECANT)]
-        sweep = sweeps.region(inward, one.kept_between_sweeps)
-        couples = [under(sweeps.branch(items), "SENT({}) > 0", INWARD, flag) for flag, items in one.couples]
-        back = sweeps.region(outward)
+        sweep, back = sweeps.region(inward), sweeps.region(outward)
         after = [*phases.epilogue, *phases.final_messages]
         ends = [item for item in after if item.array == "out"]
         final_messages = later.branch([item for item in after if item.array != "out"] + by_slot(ends))
@@ -268,7 +228,6 @@ class _SegmentProgram:
             final_messages,
             final_stores,
             pass_invariants,
-            couples,
         )
         kernel.add(work, sum(each.operations for each in emitters))
         return any(each.counts["lookup"] for each in emitters)
@@ -276,12 +235,10 @@ class _SegmentProgram:
     # -- from the work to a kernel ---------------------------------------------------------------------------------
     def _finish(self, found: SegmentsCode) -> Program:
         """Return the program of gathered work."""
-        kernel, layout, table, sent, looks_up, couples, _ = found
+        kernel, layout, table, looks_up, _ = found
         routine, T = self.job.routine, self.run.dtype
         cpu = kernel.cpu()
-        if self.local:
-            cpu = f"{C_TYPE[T]} sent[{sent}];\n#undef SENT\n#define SENT(i) sent[i]\n{cpu}"
-        cuda = cpu if self.alone else kernel.cuda()  # fills the tables
+        cuda = kernel.cuda()  # fills the tables
         registers = self._registers(layout)
         if places := self.plan.spill_slots(
             routine, layout.shared_bytes(T), wp.types.type_size_in_bytes(T), layout.warps
@@ -290,8 +247,6 @@ class _SegmentProgram:
             cuda = spill_registers(cuda, C_TYPE[T], places)
         lists = {"place": table, "table": kernel.shared.table, "shifts": kernel.shared.shifts}
         tables = {name: values for name, values in lists.items() if values} | self.builder.height_tables(looks_up)
-        if couples is not None:
-            tables |= self.builder.touch_tables(couples.points)
         cap = registers if registers < MOST_REGISTERS else None
         return self.builder.finish(routine, layout, cuda, cpu, tables, kernel.shared.operations, cap)
 
@@ -302,14 +257,13 @@ class _SegmentProgram:
         registers a thread needs then. The first entry applies that fits into the registers and the shared memory. If
         none does, the warps of one block share all registers.
         """
-        warps = 1 if self.alone else self.schedule.warps
         if self.dtype == "float32" and not self.plan.latency_bound:
             for blocks, needed in self.job.routine.hints.occupancy:
                 registers = self._shared_registers(blocks * self.schedule.warps)
                 fits = blocks * (layout.shared_bytes(self.run.dtype) + RESERVED) <= self.plan.device.shared_bytes
                 if registers >= needed and fits:
                     return registers
-        return self._shared_registers(warps)
+        return self._shared_registers(self.schedule.warps)
 
     def _shared_registers(self, warps: int) -> int:
         """Return how many registers a thread has if a multiprocessor holds so many warps, a multiple of 8.

@@ -36,7 +36,6 @@ class SegmentCode(NamedTuple):
         final_stores: what the segment computes, message by message, from the final messages of the other segments.
         pass_invariants: in work with passes, what the segment computes once before them and keeps. Where a fixed number
             of passes is counted, segments send each other messages inward ahead, too.
-        couples: what the segment leaves for each couple of bodies that touches, after the inward sweep.
     """
 
     segment: Segment
@@ -48,7 +47,6 @@ class SegmentCode(NamedTuple):
     final_messages: Listing
     final_stores: list[Listing]
     pass_invariants: Listing = Listing("", [], [], [])
-    couples: Sequence[Listing] = ()
 
     @property
     def text(self) -> tuple[str, ...]:
@@ -58,7 +56,6 @@ class SegmentCode(NamedTuple):
             self.inward.text,
             self.outward.text,
             *(each.text for each in self.checks),
-            *(each.text for each in self.couples),
         )
 
 
@@ -108,14 +105,12 @@ class WarpSpecializedKernel:
         schedule: warps and stages of the segments.
         dtype: the scalar type, "float32" or "float64".
         passes: the team repeats its work in passes; None if it does not.
-        pairs: the definition of ``team_coupling``, which couples pairs of bodies; "" if there are none.
 
     Attributes:
         shared: the texts that its warps share, and their tables.
     """
 
-    def __init__(self, schedule: Schedule, dtype: str, passes: PassLoop | None = None, pairs: str = ""):
-        self.pairs = pairs
+    def __init__(self, schedule: Schedule, dtype: str, passes: PassLoop | None = None):
         self.schedule, self.segments, self.passes = schedule, schedule.segments.all, passes
         self.dtype, self.c = dtype, C_TYPE[dtype]
         self.shared = SharedCode(dtype)
@@ -130,10 +125,6 @@ class WarpSpecializedKernel:
     def texts(self) -> list[tuple[str, ...]]:
         """The texts that are equal for segments that share their code, by segment."""
         return [self._work[segment.index].text for segment in self.segments]
-
-    @property
-    def _definitions(self) -> list[str]:
-        return [self.pairs] if self.pairs else []
 
     @property
     def _last(self) -> int:
@@ -155,10 +146,6 @@ class WarpSpecializedKernel:
                 if self._work[segment.index].assigned.inward == stage:
                     text += [self._branch(segment, each) for each in self._work[segment.index].laws]
                     text.append(render(self._work[segment.index].inward, self.dtype, f"p{segment.index}_"))
-                    responses = [self._branch(segment, each) for each in self._work[segment.index].couples]
-                    text += ["if (coupled) {", *responses, "}"] if responses else []
-            text += [couple_pairs("0", 1)] if self.pairs and stage == 0 else []
-            text += [release_pairs("0", 1)] if self.pairs and stage == self._last else []
             for segment in self.segments:
                 if self._work[segment.index].assigned.outward == stage:
                     text.append(render(self._work[segment.index].outward, self.dtype, f"p{segment.index}_"))
@@ -174,15 +161,12 @@ class WarpSpecializedKernel:
             pass_invariants = [
                 self._branch(work.segment, work.pass_invariants) for work in order if work.pass_invariants.text
             ]
-            if self.pairs:
-                pass_invariants += [begin_pairs("0", 1)]
-                text = [push_pairs("LOAD", "0", 1), *text, judge_pairs("0", 1)]
             one, counted = "\n".join(text), self.passes.counted
             if counted:
                 loop = pass_loops.count_team_passes(one, "", self.c)
             else:
                 loop = pass_loops.repeat_thread_passes(one, self.c)
-            text = [*self._definitions, self.passes.declare(kept, self.c), *pass_invariants, loop]
+            text = [self.passes.declare(kept, self.c), *pass_invariants, loop]
         return "\n".join(text + later)
 
     def _branch(self, segment: Segment, listing: Listing) -> str:
@@ -199,13 +183,7 @@ class WarpSpecializedKernel:
         for equal in kinds.values():
             text.append(f"{'else ' if text else ''}if ({any_of(_warps(equal))}) {{")
             inward, outward = self._shared_sweeps(equal)
-            warps = [work.assigned.warp for work in equal]
-            between = self._inner(warps)
-            if self.pairs:
-                inward = "\n".join([push_pairs("LOAD", "warp", self.schedule.warps), inward])
-                couple, release = (call("warp", self.schedule.warps) for call in (couple_pairs, release_pairs))
-                between = "\n".join([BARRIER, couple, between, release])
-            text += [inward, between, outward]
+            text += [inward, self._inner(_warps(equal)), outward]
             if not self.passes and any(work.final_stores for works in kinds.values() for work in works):
                 text += [
                     self._take_turns(equal, [[work.final_messages] for work in equal], "n_"),
@@ -230,12 +208,9 @@ class WarpSpecializedKernel:
             free[warp] = work
         names = ["", *(f"i{at}_" for at in range(len(ranks) - 1))]
         kept = {name: [work.segment for work in rank.values()] for name, rank in zip(names, ranks, strict=True)}
-        text = [*self._definitions, self.passes.declare(kept, self.c)]
+        text = [self.passes.declare(kept, self.c)]
         ranks_by_name = dict(zip(names, ranks, strict=True))
         text += self._before_passes(leaves, ranks_by_name)
-        if self.pairs:
-            text += [BARRIER, begin_pairs("warp", self.schedule.warps)]
-            a_pass = "\n".join([a_pass, BARRIER, judge_pairs("warp", self.schedule.warps)])
         if self._laws_in_loops:
             a_pass = "\n".join(
                 [
@@ -350,54 +325,11 @@ class WarpSpecializedKernel:
         """Return one text for the inward and one for the outward sweeps of segments of equal structure."""
         checks = [] if self._laws_in_loops else list(map(list, zip(*(work.checks for work in equal), strict=True)))
         regions = [[work.inward for work in equal], [work.outward for work in equal], *checks]
-        regions += [list(each) for each in zip(*(work.couples for work in equal), strict=True)]
         who = choose(_warps(equal), range(len(equal)))
         head, (inward, outward, *others) = self.shared.merge(regions, prefix, prefix, who)
-        check, couples = "\n".join(others[: len(checks)]), others[len(checks) :]
-        inward = "\n".join([inward, "if (coupled) {", *couples, "}"]) if any(couples) else inward
+        check = "\n".join(others)
         outward = "\n".join([outward, "{", check, "}"]) if check else outward
         return f"{head}\n{inward}" if head else inward, outward
-
-
-def begin_pairs(warp: str, warps: int) -> str:
-    """Return code that begins the pairs of bodies before the passes, for a warp of a team; ``coupled``: some touch."""
-    call = f"team_coupling::begin(sent, touches.data + column, touches.shape[1], dt_row[0], {warp}, {warps})"
-    return f"bool coupled = {_any_world(call, warps)};"
-
-
-def push_pairs(which: str, warp: str, warps: int) -> str:
-    """Return code that leaves wrenches on the bodies of a warp's segment, from the "LOAD" or the "CHANGE" of
-    couples."""
-    return f"team_coupling::push(sent, AT_{which}, coupled, {warp}, {warps});"
-
-
-def couple_pairs(warp: str, warps: int) -> str:
-    """Return code that couples the pairs when all segments have come in."""
-    build = f"team_coupling::build(sent, dt_row[0], {warp}, {warps})"
-    return f"if (coupled) {build};\nelse team_coupling::rest(sent, {warp});"
-
-
-def release_pairs(warp: str, warps: int) -> str:
-    """Return code that finds the forces of couples when the base has its acceleration, and leaves the wrenches."""
-    solve = "team_coupling::solve(sent, dt_row[0]);"
-    text = f"if ({warp} == 0) {solve}\n{BARRIER}" if warps > 1 else solve
-    return "\n".join([f"if (coupled) {{\n{text}\n}}", push_pairs("CHANGE", warp, warps)])
-
-
-def judge_pairs(warp: str, warps: int) -> str:
-    """Return code that takes the bodies' twists after a pass to the points of pairs, for the next one."""
-    call = (
-        "team_coupling::after(sent, touches.data + column, touches.shape[1], dt_row[0], closing, last, coupled, {}, {})"
-    )
-    return "\n".join([
-        "const bool last = turn + 1 == (int)passes_row[0];",
-        "const bool closing = turn > passes_row[0] - 2.5 && passes_row[0] > 2.5;",
-        f"coupled = {_any_world(call.format(warp, warps), warps)};",
-    ])  # fmt: skip
-
-
-def _any_world(call: str, warps: int) -> str:
-    return f"__syncthreads_or({call})" if warps > 1 else call
 
 
 def _warps(works: Sequence[SegmentCode]) -> list[int]:

@@ -2,7 +2,8 @@
 
 The rule is that of Newton's ``finalize``, in float64 and with the names of the bodies. A negative mass becomes zero,
 and a massless body has no inertia. All principal moments grow by the same amount until the least is positive, and
-again until none exceeds the sum of the other two.
+again until none exceeds the sum of the other two. Newton's smallest moments are in kg m^2, so that it replaces those of
+every body of a few grams; here they shrink with the largest moment of a body where that is below ``SMALL``.
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ import numpy as np
 from ..worlds import quote_labels
 
 LEAST_SHARE = 1e-6  # least principal moment as a share of the largest; Newton's figure, as are all below
-LEAST = 1e-10  # least principal moment [kg m^2]; also the excess over the triangle inequality that counts as rounding
+LEAST = 1e-10  # least moment of a body that has none [kg m^2]; also the excess over the triangle inequality that counts
+# as rounding
 ADDED = 1e-6  # what a replaced inertia gets beyond the least that it needs [kg m^2]
 ROUNDING = 1.2e-7  # relative excess over the triangle inequality that counts as rounding
+SMALL = 1e-3  # largest moment below which LEAST and ADDED shrink in proportion [kg m^2]: ADDED is 1/1000 of it
 
 
 def repaired(mass: float, inertia: np.ndarray) -> tuple[float, np.ndarray]:
@@ -25,11 +28,12 @@ def repaired(mass: float, inertia: np.ndarray) -> tuple[float, np.ndarray]:
     if not (np.isfinite(mass) and np.isfinite(inertia).all() and mass > 0.0):
         return 0.0, np.zeros((3, 3))
     moments = np.linalg.eigvalsh(0.5 * (inertia + inertia.T))
-    least = max(LEAST_SHARE * moments[2], LEAST)
-    growth = least - moments[0] + ADDED if moments[0] < least else 0.0
+    share = min(1.0, moments[2] / SMALL) if moments[2] > 0.0 else 1.0
+    least = LEAST_SHARE * moments[2] if moments[2] > 0.0 else LEAST
+    growth = least - moments[0] + share * ADDED if moments[0] < least else 0.0
     low, middle, high = moments + growth
-    if low + middle < high - max(ROUNDING * high, LEAST):
-        growth += high - low - middle + ADDED
+    if low + middle < high - max(ROUNDING * high, share * LEAST):
+        growth += high - low - middle + share * ADDED
     return mass, 0.5 * (inertia + inertia.T) + growth * np.eye(3) if growth else inertia
 
 

@@ -55,7 +55,7 @@ def mesh_file(mesh: XmlElement, why: str) -> Path:
     elif scheme == "file":
         candidates = [Path(rest.removeprefix("localhost"))]
     else:
-        candidates = [above / rest for above in (folder, *folder.parents)]
+        candidates = [above / rest.lstrip("/") for above in (folder, *folder.parents)]
     for candidate in candidates:
         if candidate.is_file():
             return candidate

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import quoted, shown
-from ...execution.joint_tables import why_few_pairs
+from ...execution.joint_tables import why_unsolved
 from ...scene.collision_shapes import CollisionShape
 from ...scene.contact_shapes import SHAPES, kinds_in
 from ...scene.scene import Scene
@@ -67,7 +67,9 @@ def urdf_pairs(call: str, scene: Scene, shapes: list[CollisionShape]) -> PairSel
     def apart(one: CollisionShape, other: CollisionShape) -> bool:
         return above[one.body] != piece[other.body] and above[other.body] != piece[one.body]
 
-    return PairSelection(call, scene, shapes, apart, dict(enumerate(shapes)), takes_still=True, why_few=why_few_pairs)
+    return PairSelection(
+        call, scene, shapes, apart, dict(enumerate(shapes)), takes_still=True, why_unsolved=why_unsolved
+    )
 
 
 def _urdf_sizes(shape: Any) -> tuple[str, Any, tuple[str, ...]]:

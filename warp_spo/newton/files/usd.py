@@ -13,7 +13,7 @@ import numpy as np
 from newton.usd import SchemaResolverNewton
 
 from ...errors import UnsupportedError, shown
-from ...execution.joint_tables import why_few_pairs
+from ...execution.joint_tables import why_unsolved
 from ...scene.collision_shapes import NONE, CollisionShape, ShapeSelection
 from ...scene.contacts import Contact
 from ...scene.scene import Scene
@@ -32,6 +32,7 @@ from .usd_values import (
     with_scaled_drives,
     with_weightless_bodies,
 )
+from .usd_world_joints import joints_placed_on_world, place_joints_on_world
 
 UNITS = (1e-9, 1e9)
 """Least and largest unit of length [m] and of mass [kg] of a file."""
@@ -90,12 +91,14 @@ def _read(
         if not UNITS[0] <= unit <= UNITS[1]:
             raise ValueError(f"{call}: {name} is {unit}; expected a number between {UNITS[0]:g} and {UNITS[1]:g}")
     check_values(call, stage)
+    placed = joints_placed_on_world(stage)
     prepare(call, stage)
     builder, found = _imported(stage, floating, metre**3 / kilogram)
     if builder.body_count == 0:
         raise ValueError(f"{call} has no rigid bodies; expected prims with PhysicsRigidBodyAPI")
     joints = ImportedJoints(call, stage, builder, found["path_joint_map"])
     joints.turn_offsets_of_mimics()
+    place_joints_on_world(stage, builder, found["path_joint_map"], placed)
     accelerated = joints.accelerated()
     if (metre, kilogram) != (1.0, 1.0):
         _convert(builder, metre, kilogram, found.get("physics_scene_path") is not None, accelerated)
@@ -265,7 +268,7 @@ def scene_of(file: Path, builder: newton.ModelBuilder, repair: bool, selection: 
         return shapes().touches(shape, ground)
 
     def pairs() -> PairSelection:
-        return select_pairs(call, shapes(), scene, takes_still=True, why_few=why_few_pairs)
+        return select_pairs(call, shapes(), scene, takes_still=True, why_unsolved=why_unsolved)
 
     scene, lost = selection.apply(
         call, scene, lambda: shapes().first(), touches, CollisionShape.with_mean_material, pairs=pairs

@@ -129,6 +129,9 @@ NEUTRAL: dict[str, tuple[Any, ...]] = {
     "physxCollision:restOffset": (float("-inf"),),
 }
 """Values that mean nothing, of attributes that no schema at hand defines; of others it is zero, false or empty."""
+PLACE: Names = ("xformOp*",)
+SHAPE: Names = ("size", "radius*", "height", "axis", "width", "length", "points", "faceVertex*", "orientation")
+"""Attributes of geometry, of a prim with a body or a shape at or below it, and of a shape itself."""
 UNBOUNDED = 1e30
 """What is above is without bound: files write the largest number of float32 for it."""
 MOST = 100
@@ -143,12 +146,23 @@ def left_out(stage: Any, loops: set[str], joints: set[str], scene_path: str | No
             loops. scene_path: of the scene whose gravity counts. contacts: whether attributes of contact matter.
     """
     found: dict[str, list[str]] = {}
-    for prim in all_prims(stage):
+    prims = list(all_prims(stage))
+    places = {place for prim in prims if _has_place(prim) for place in prim.GetPath().GetPrefixes()}
+    for prim in prims:
         path = str(prim.GetPath())
         for what in _unread(prim, path, loops, joints, scene_path, contacts):
             found.setdefault(what, []).append(path)
+        names = (PLACE if prim.GetPath() in places else ()) + (SHAPE if prim.HasAPI("PhysicsCollisionAPI") else ())
+        for attribute in prim.GetAuthoredAttributes() if names else ():
+            if matches(attribute.GetName(), names) and _changes(attribute):
+                found.setdefault(attribute.GetName(), []).append(path)
     words = [f"{shown(what, 120)} ({_places(paths)})" for what, paths in found.items()]
     return words[:MOST] + ([f"and {len(words) - MOST} more attributes"] if len(words) > MOST else [])
+
+
+def _has_place(prim: Any) -> bool:
+    """Return whether the place of a prim is read: of a body or a shape."""
+    return bool(prim.HasAPI("PhysicsRigidBodyAPI") or prim.HasAPI("PhysicsCollisionAPI"))
 
 
 def _places(paths: list[str]) -> str:
@@ -211,7 +225,12 @@ def _has_gains(values: Mapping[str, Any], name: str) -> bool:
 
 def _changes(attribute: Any) -> bool:
     """Return whether an attribute has values at times alone; no one value is that of a scene."""
-    return not hasattr(attribute, "GetTargets") and attribute.Get() is None and attribute.GetNumTimeSamples() > 0
+    from pxr import Usd
+
+    if hasattr(attribute, "GetTargets") or not attribute.GetNumTimeSamples():
+        return False
+    # Without a value of the file, Get returns the schema's.
+    return bool(attribute.GetResolveInfo(Usd.TimeCode.Default()).GetSource() != Usd.ResolveInfoSourceDefault)
 
 
 def _is_symmetric(values: Mapping[str, Any]) -> bool:
@@ -226,9 +245,11 @@ def _says_nothing(prim: Any, attribute: Any) -> bool:
     name = attribute.GetName()
     if hasattr(attribute, "GetTargets"):
         return not attribute.GetTargets()
+    if _changes(attribute):
+        return False
     value = attribute.Get()
     if value is None:
-        return not _changes(attribute)
+        return True
     own = prim.GetPrimDefinition().GetAttributeFallbackValue(name)
     if own is not None:
         return bool(value == own) or (own == math.inf and value > UNBOUNDED)

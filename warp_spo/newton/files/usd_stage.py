@@ -200,7 +200,7 @@ def prepare(call: str, stage: Any) -> None:
                     f"{call}: {shown(str(relation.GetPath()))} leads to {places}; expected one prim of the stage, or "
                     "none for the world"
                 )
-        for end in (_end(stage, joint.GetBody0Rel()), _end(stage, joint.GetBody1Rel())):
+        for end in (body_of(stage, joint.GetBody0Rel()), body_of(stage, joint.GetBody1Rel())):
             if end and not _is_enabled(stage.GetPrimAtPath(end)):
                 raise UnsupportedError(
                     call,
@@ -254,7 +254,7 @@ def _free_axes_without_limits(call: str, prim: Any) -> None:
             )
 
 
-def _end(stage: Any, relation: Any) -> str:
+def body_of(stage: Any, relation: Any) -> str:
     """Return the path of the rigid body to which a relationship of a joint leads, "" for the world."""
     from pxr import UsdPhysics
 
@@ -267,7 +267,7 @@ def _end(stage: Any, relation: Any) -> str:
 
 def reversed_joints(stage: Any, joints: list[Any]) -> list[Any]:
     """Return the joints whose ``body0`` is their child, where the joints make up a tree; a loop is left as it is."""
-    ends = {joint: (_end(stage, joint.GetBody0Rel()), _end(stage, joint.GetBody1Rel())) for joint in joints}
+    ends = {joint: (body_of(stage, joint.GetBody0Rel()), body_of(stage, joint.GetBody1Rel())) for joint in joints}
     turned = [joint for joint in joints if ends[joint][0] and not ends[joint][1]]
     inside = [j for j in joints if not j.GetExcludeFromArticulationAttr().Get() and not is_equality(j.GetPrim())]
     neighbors: dict[str, dict[str, list[Any]]] = {}

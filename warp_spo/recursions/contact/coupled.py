@@ -17,13 +17,13 @@ from ..model.links import Link, Links
 from ..step.phases import StepPhases
 from . import aggregates
 from .aggregates import LAST, Node, Seat, Seats, Tie, add
-from .pairs import RESIDUAL, place_axes_of, values_of, velocities_of
+from .pairs import place_axes_of, values_of, velocities_of
 from .points import TracedContactPoint, with_ancestors
 from .step import ContactStepTrace, PointState
 from .ties import Couple, TiePlan, couples_of, flies, key
 
 if TYPE_CHECKING:
-    pass
+    from ..model.tracing import Trace
 
 PLACE, VALUE, DAMPER = "couple_place", "couple_value", "couple_damper"
 START, TWIST = "couple_start", "couple_twist"
@@ -181,13 +181,12 @@ class CoupledStep(ContactStepTrace):
                 first = PLACES * pair + 12 * side
                 self.first += [Store(PLACE, (first + i,), value) for i, value in enumerate(values)]
 
-    def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, Twist]) -> dict[int, Value]:
+    def after_sweep(self, alpha: dict[int, Twist]) -> None:
         """Leave the relative twists after the pass."""
         for number, couple in enumerate(self.couples):
             self.trace.label(couple.f, f"t{number}_")
             twist = self._twist(number, couple, self.velocities) + self._twist(number, couple, alpha) * self.h
             self.twists += _twist_stores(TWIST, number, twist)
-        return gains
 
     def last_excess(self) -> tuple[list[Value], ...]:
         """Return cone, pull, effort and lacking push of all couples after the last pass."""
@@ -200,7 +199,7 @@ class CoupledStep(ContactStepTrace):
         """Return the stores of what couples report, after the rows of the points."""
         first, offset = len(self.trace.links.scene.contact_points), {"contact_gap": 3, "contact_slip": 4}
         read = lambda i: self.trace.graph.input(REPORT, i)  # noqa: E731
-        stores = [Store(name, (), 0.0)] if name == RESIDUAL else []
+        stores: list[Store] = []
         for number, couple in enumerate(self.couples):
             axes = self.plan.by_couple[number].base if couple.ties else couple.f
             for pair, sign in zip(couple.pairs, couple.signs, strict=True):
@@ -216,3 +215,8 @@ class CoupledStep(ContactStepTrace):
 
 def _twist_stores(array: str, number: int, twist: Vector) -> list[Store]:
     return [Store(array, (6 * number + i,), value) for i, value in enumerate((*twist[3:], *twist[:3]))]
+
+
+def step(trace: Trace, qdd: bool = False, status: bool = False, reports: tuple[str, ...] = ()) -> StepPhases:
+    """out = qd', q_out = q'; with ``qdd`` qdd_out, with ``status`` the word of each world; and the ``reports``"""
+    return CoupledStep(trace, reports).stores(qdd, status)

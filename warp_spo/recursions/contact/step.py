@@ -85,11 +85,10 @@ class ContactStepTrace(Step):
         phases.add_invariants(value for group in self.cull_groups.values() for value in (group.highest, group.reach))
         terms, tau = self._step_terms(points, states), trace.vector("tau")
         done, rates, sent = self.inward(terms, lambda dof: tau(dof) + self.forces[dof] - bias[dof])
-        rates = self.close(done, rates)
         alpha: dict[int, Twist] = {}
         moved = self.outward(done, rates, alpha)
         gains = {item.index[0]: self.h * item.value for item in moved if item.array == "out"}
-        gains = self.couple(done, gains, alpha)
+        self.after_sweep(alpha)
         passed = [item for item in moved if item.array != "out"]
         passed += [Store(GAIN, (trace.exchange.place_of(dof),), gain) for dof, gain in gains.items()]
         efforts = []
@@ -100,7 +99,7 @@ class ContactStepTrace(Step):
                 for dof in link.dofs
                 for law in self.secant_laws[dof]
             ]
-        excess = self.coupled_excess()
+        excess: tuple[list[Value], ...] = [], [], []
         forces = self._forces(points, states, alpha, excess)
         for number, surfaces in forces.items():
             self._report(number, surfaces)
@@ -159,28 +158,12 @@ class ContactStepTrace(Step):
         return expand(self.trace, done, rates, (ZERO, ZERO), alpha=alpha)
 
     # -- bodies that touch each other ------------------------------------------------------------------------------
-    def close(self, done: dict, rates: dict) -> dict:
-        """Return the rates of a segment, by link, with what forces between its bodies and others add."""
-        return rates
-
-    def couple(self, done: dict, gains: dict[int, Value], alpha: dict[int, Twist]) -> dict[int, Value]:
-        """Return qd' - qd by dof with the forces between bodies; ``alpha`` becomes that of the links."""
-        return gains
-
-    def coupled_excess(self) -> tuple[list[Value], list[Value], list[Value]]:
-        """Return by how much forces between bodies leave their cones, how much they pull, and pushes that are missing.
-
-        Those of points with the ground are added.
-        """
-        return [], [], []
+    def after_sweep(self, alpha: dict[int, Twist]) -> None:
+        """Keep what bodies that touch each other read of the accelerations of links by id after a pass."""
 
     def last_excess(self) -> tuple[list[Value], ...]:
-        """Return the same of the last pass where no pass knows it: cones, pulls, efforts, missing pushes."""
+        """Return by how much bodies that touch each other leave their laws: cones, pulls, efforts, missing pushes."""
         return [], [], [], []
-
-    def reported(self) -> list[Store]:
-        """Return the stores of reports on bodies that touch each other that follow after all segments are done."""
-        return []
 
     # -- hinges ----------------------------------------------------------------------------------------------------
     def _active_pieces(self, link: Link) -> list[Law]:
@@ -356,11 +339,10 @@ class ContactStepTrace(Step):
             phases.add_final_messages(exchange.send("E", exchange.own_segments[0], self.excess))
             if exchange.is_first:
                 sent_by = zip(*(exchange.receive("E", piece) for piece in exchange.segments), strict=True)
-                kinds = ((*values, *more) for values, more in zip(sent_by, self.last_excess(), strict=True))
-                self.excess = [largest(list(values)) for values in kinds]
+                self.excess = [largest(list(values)) for values in sent_by]
         sent, word = self._send_status(results) if status else ([], [])
         phases.add_final_messages(sent)
-        last = [*self._excess_stores(), *self.reported(), *word] if exchange.is_first else []
+        last = [*self._excess_stores(), *word] if exchange.is_first else []
         if last:
             phases.add_final_stores(last)
 

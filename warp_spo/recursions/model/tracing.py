@@ -8,16 +8,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping
-from typing import Any
 
-from ...trace.emission import Store
-from ...trace.scalars import Entry, Value
+from ...trace.scalars import Entry
 from ...trace.spatial import IDENTITY, ZERO, Matrix, Twist, Vector, cross
 from .. import motion, newton_euler
 from ..motion import STILL, VelocityTerms
 from .exchange import Exchange, WholeTree
 from .links import Link, LinkPlacement, Links, place_link
-from .segments import Segment
 
 EPSILON = {"float32": 2.0**-23, "float64": 2.0**-52}
 
@@ -36,18 +33,12 @@ class Trace:
         places: by id of the link: its placement. motions: its velocity terms. axes: its axes in the inertial frame.
         compensates_gravity: external wrenches hold up the bodies' ``gravcomp``, as forces of the hinges do.
         substitutes: entries that take the place of those of an array, by its name.
-        team: of a segment, the pairs of bodies that native code couples between its sweeps. couples: what it stores for
-            each couple of bodies that touches, and the entry that says so; kept_between_sweeps: values that both sweeps
-            use.
     """
 
     def __init__(self, links: Links, dtype: str, inputs: tuple[str, ...], exchange: Exchange | None = None):
         self.links, self.graph, self.epsilon, self.inputs = links, links.graph, EPSILON[dtype], inputs
         self.exchange = WholeTree(links) if exchange is None else exchange
         self.substitutes: dict[str, Entry] = {}
-        self.team: Any = None
-        self.couples: list[tuple[int, list[Store]]] = []
-        self.kept_between_sweeps: list[Value] = []
         self.places: dict[int, LinkPlacement] = {}
         self.motions: dict[int, VelocityTerms] = {}
         self.axes: dict[int, Matrix] = {}
@@ -150,8 +141,3 @@ class Trace:
         """The bodies on the links of this segment; bodies that do not move count as the first segment's."""
         carriers, exchange = {body: placement.link for body, placement in self.links.placements.items()}, self.exchange
         return [body for body, link in carriers.items() if (exchange.is_first if link is None else exchange.own(link))]
-
-    @property
-    def segment(self) -> Segment | None:
-        """The segment of an evaluation of one, for the code that couples bodies; None: it takes the whole tree."""
-        return None if self.exchange.alone else self.exchange.own_segments[0]
