@@ -65,7 +65,7 @@ class Joints(NamedTuple):
     sizes: tuple[int, int, int]
     age: int
     decimation: int
-    half: tensor_networks.Shape | None = None
+    half: tensor_networks.NetworkShape | None = None
 
     @property
     def count(self) -> int:

@@ -22,7 +22,7 @@ BOUNDED = ("softsign", "tanh")
 PAIRS = True  # softsign takes one reciprocal for two sums
 
 
-class Shape(NamedTuple):
+class NetworkShape(NamedTuple):
     """All of a network that its text depends on.
 
     Attributes:
@@ -96,7 +96,7 @@ struct on_tensor_cores
 """Fragments of matrices are as PTX has them for mma.m16n8k8 of tf32 and mma.m16n8k16 of f16."""
 
 
-def define(name: str, shape: Shape) -> str:
+def define(name: str, shape: NetworkShape) -> str:
     """Return the definition of ``name::tile(staged, weights, sums)``, which needs PRODUCTS.
 
     A warp calls it for 16 rows of inputs in shared memory, [input, PITCH]. Lane 4 g + t gets the sums of the last

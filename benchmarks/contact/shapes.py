@@ -46,6 +46,8 @@ def fields(cell: float = CELL) -> dict[str, tuple[spo.HeightField, float]]:
     found = {name: (spo.HeightField(heights, cell, corner), width) for name, (heights, width) in made.items()}
     found["rough, 5 cm"] = spo.terrain.rough((4.0, 4.0), cell, amplitude=0.05), 1.0
     found["stairs of 10 cm"] = spo.terrain.stairs((4.0, 4.0), cell, riser=0.1, tread=0.3), 1.5
+    outer = 0.1 * (slope <= 0.0) * (slope.T <= 0.0)
+    found["outer corner of 10 cm"] = spo.HeightField(outer, cell, corner), 0.15
     return found
 
 

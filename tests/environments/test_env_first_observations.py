@@ -449,7 +449,7 @@ def make_layout():
     from warp_spo.env.compile.guard import Guard
     from warp_spo.env.compile.memory_layout import MemoryLayout
 
-    return MemoryLayout(scene(), np.zeros(9), 0.02, None, (), Guard({}))
+    return MemoryLayout(scene(), np.zeros(9), 0.02, 5e-3, None, (), Guard({}))
 
 
 @pytest.mark.slow

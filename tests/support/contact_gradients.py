@@ -56,7 +56,14 @@ def store(stores, known, found):
     for item, value in zip(stores, values, strict=False):
         found[item.array][(slice(None), *item.index)] = value
     worlds = len(known["q"])
-    return np.array([np.broadcast_to(value, worlds) for value in values[len(outputs) :]]).T
+    answers = [np.broadcast_to(value, worlds) for value in values[len(outputs) :]]
+    return np.array([two_digits(x) if of.op == "search" else x for of, x in zip(asked, answers, strict=True)]).T
+
+
+def two_digits(values):
+    """Numbers that a search finds, without what follows the pose smoothly: from which a place is found anew."""
+    size = 10.0 ** np.floor(np.log10(np.maximum(abs(values), 1e-6)) - 1.0)
+    return np.where(values == np.round(values), values, np.round(values / size) * size)
 
 
 def cells_of(known):

@@ -147,7 +147,8 @@ class Env(VecEnv):
         terms = arguments.check_terms(observations, rewards, terminations or {}, metrics or {}, events)
         self.bounds = arguments.check_bounds(bounds)
         guard = Guard(self.bounds.limits(scene, self.dt, episode_length_s, list(terms[1]), terms[0]))
-        self._layout = MemoryLayout(scene, default, self.step_dt, commands, changed_values(scene, events), guard)
+        times, changed = (self.step_dt, self.dt), changed_values(scene, events)
+        self._layout = MemoryLayout(scene, default, *times, commands, changed, guard)
         self._layout.keeps_failures = keep_failures is not None
         tracing = self._trace(arguments.check_parts(actions), *terms, commands, events)
         variable = self._layout.values

@@ -37,6 +37,7 @@ HOLD = 300.0  # resistance of a velocity limit, in inertias over the step
 MIDPOINT_PASSES = 4  # passes from which on a step uses the midpoint scheme
 ITERATIONS = 2  # of as many passes each
 AWAY = -1e3  # depth of a surface that is not there [m]
+FASTER, REACHES = 5.0, 2.0  # speed that a step may add to a shape's [m/s]; way per speed and step that is looked down
 PUSH_OUT = 1.0  # speed [m/s] at most at which a point that is slow comes out of the ground
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
 LENGTH, LEAST_LENGTH = 0.1, 3e-5  # of a body that cannot turn, or whose point cannot move; what is too short to be one
@@ -230,10 +231,10 @@ def _slip(n, x):
 def surfaces(field, at, number=0, moves=(0.0, 0.0, 0.0), walls=True):
     """Return normal and depth of the surfaces of a height field near a point that the step takes by ``moves``.
 
-    They are the field's own, or a floor and a wall where the middle slope of the cell exceeds 1. The wall ends at the
-    highest corner. Beyond an edge the field is level across it. A cell without a wall is followed by the wall of the
-    cell where the step takes the point, if that rises along ``moves``. Of a set of fields it is that of this number.
-    Without ``walls`` they are the field's own.
+    They are the field's own, or a floor and a wall where the middle slope of the cell exceeds 1. The wall is the plane
+    that touches the cell there, and ends at its highest corner. Beyond an edge the field is level across it. A cell
+    without a wall is followed by the wall of the cell where the step takes the point, if that rises along ``moves``. Of
+    a set of fields it is that of this number. Without ``walls`` they are the field's own.
     """
     h, place = field.heights.reshape(-1, *field.heights.shape[-2:])[number], at[:2] - field.origin[:2]
     place, ahead = place / field.cell, (place + moves[:2]) / field.cell
@@ -247,19 +248,28 @@ def surfaces(field, at, number=0, moves=(0.0, 0.0, 0.0), walls=True):
         middle = np.array([corners[1] - corners[0], corners[:, 1] - corners[:, 0]]).mean(axis=1) / field.cell
         return corners, middle, place - first
 
-    def wall(corners, middle, inside):
-        plane = corners.mean() + field.cell * middle @ (inside - 0.5)
-        return [(upward(middle), (plane - z) * upward(middle)[2])] if z <= corners.max() else []
+    def over(corners, s, t):
+        """The height of a cell's surface at a place, and its slope there."""
+        height = np.array([1.0 - s, s]) @ corners @ np.array([1.0 - t, t])
+        slope_x = np.array([1.0 - t, t]) @ (corners[1] - corners[0])
+        slope_y = np.array([1.0 - s, s]) @ (corners[:, 1] - corners[:, 0])
+        return height, np.array([slope_x, slope_y]) / field.cell
+
+    def wall(corners, inside):
+        """The plane that touches a cell where it is nearest to the place, and its slope."""
+        nearest = np.clip(inside, 0.0, 1.0)
+        height, slope = over(corners, *nearest)
+        plane = height + slope @ (np.array(field.cells) * (inside - nearest))
+        return [(upward(slope), (plane - z) * upward(slope)[2])] if z <= corners.max() else [], slope
 
     corners, middle, (s, t) = cell(place)
     if walls and np.linalg.norm(middle) > 1.0:
-        return [(np.array([0.0, 0.0, 1.0]), corners.min() - z), *wall(corners, middle, np.array([s, t]))]
-    height = np.array([1.0 - s, s]) @ corners @ np.array([1.0 - t, t])
-    slope = np.array([np.array([1.0 - t, t]) @ (corners[1] - corners[0]),
-                      np.array([1.0 - s, s]) @ (corners[:, 1] - corners[:, 0])]) / field.cell  # fmt: skip
-    after = cell(ahead)
-    rises = walls and np.linalg.norm(after[1]) > 1.0 and after[1] @ moves[:2] > 0.0
-    return [(upward(slope), (height - z) * upward(slope)[2]), *(wall(*after) if rises else [])]
+        return [(np.array([0.0, 0.0, 1.0]), corners.min() - z), *wall(corners, np.array([s, t]))[0]]
+    height, slope = over(corners, s, t)
+    corners, middle, inside = cell(ahead)
+    found, rising = wall(corners, inside)
+    rises = walls and np.linalg.norm(middle) > 1.0 and rising @ moves[:2] > 0.0
+    return [(upward(slope), (height - z) * upward(slope)[2]), *(found if rises else [])]
 
 
 def upward(field, at, number=0):
@@ -357,11 +367,11 @@ class ContactStep:
             up = np.array(ground.normal if plane else (0.0, 0.0, 1.0))
             if point.support is not None and not plane and point.support.kind not in ("corner", "hull corner"):
                 up = upward(ground, middle - moved, which)
-            grid = self._grid_touch(point, middle, moved, which)
+            grid = self._grid_touch(point, middle, moved, which, path)
             seat, hub, more = self._support_place(point, up, path) if grid is None else (grid[2], grid[2], 0.0)
             is_there = grid is not None or point.support is None or self._is_there(point, up)
             if point.support is not None and not plane and point.support.kind == "hull corner":
-                *place, is_there = self._field_row(point, middle, moved, which)
+                *place, is_there = self._field_row(point, middle, moved, which, path)
                 seat = hub = point.position + np.array(point.support.axes).T @ place
             at = (dense.body_matrix[point.body] @ homogeneous([*seat, 0, 0, 0, 1]))[:3, 3]
             bending = dense.jacobian_bias(path, [(point.body, (*hub, 0, 0, 0, 1))])[0, :3]
@@ -399,7 +409,7 @@ class ContactStep:
                 self.numbers.append(number)
         return Points(*(np.array(column) for column in zip(*rows, strict=True)))
 
-    def _grid_touch(self, point, middle, moved, which):
+    def _grid_touch(self, point, middle, moved, which, path):
         """Return normal, depth and place in the body of a point that touches a field's grid; None: of another one.
 
         ``middle``: of its shape. It is AWAY where the search found nothing.
@@ -410,19 +420,22 @@ class ContactStep:
         pose, start, cell = self.dense.body_matrix[point.body], np.array(ground.origin) + moved, np.array(ground.cells)
         axes, shape = np.array(support.axes) @ pose[:3, :3].T, support.kind.partition(" ")[0]
         heights = ground.heights.reshape(-1, *ground.heights.shape[-2:])
-        row = self._field_row(point, middle, moved, which)
+        row = self._field_row(point, middle, moved, which, path)
         found = touched(shape, heights[which], cell, middle - start, axes, support.sizes, point.radius, row)
         if found is None:
             return np.array([0.0, 0.0, 1.0]), AWAY, np.array(point.position)
         return *found[:2], pose[:3, :3].T @ (found[2] + start - pose[:3, 3])
 
-    def _field_row(self, point, middle, moved, which):
-        """Return the row that a search in the field finds for a point of a shape."""
+    def _field_row(self, point, middle, moved, which, path):
+        """Return the row that a search in the field finds for a point of a shape which moves along ``path``."""
         support, ground, turn = point.support, self.scene.ground, self.dense.body_matrix[point.body][:3, :3]
         shape = "corners" if support.kind == "hull corner" else support.kind.partition(" ")[0]
         heights = ground.heights.reshape(-1, *ground.heights.shape[-2:])
+        twist = self.dense.jacobian([(point.body, (*point.position, 0, 0, 0, 1))])[0] @ path
+        speed = np.linalg.norm(twist[:3]) + np.linalg.norm(twist[3:]) * np.sum(support.sizes)
+        below = self.h * (REACHES * speed + FASTER)
         numbers = [which * heights[0].size, *(middle - ground.origin - moved), *(support.axes @ turn.T).ravel()]
-        numbers += [*support.sizes, *ground.cells, *heights[0].shape, *support.table]
+        numbers += [*support.sizes, *ground.cells, *heights[0].shape, below, *support.table]
         return find(shape, heights.ravel(), numbers)[support.number]
 
     def _is_there(self, point, up):

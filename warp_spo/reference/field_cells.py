@@ -17,3 +17,15 @@ def cell_at(place, shape):
     last = np.array(shape) - 1
     inside = np.minimum(np.floor(np.clip(place, 0.0, last)), last - 1)
     return np.where(np.less(place, 0.0), -1, np.where(np.less(last, place), last, inside)).astype(int)
+
+
+def twist_of(corners):
+    """Return how far the last corner of a cell [2, 2] is above the plane of the others [m]."""
+    return corners[0, 0] - corners[0, 1] - corners[1, 0] + corners[1, 1]
+
+
+def over_cell(corners, cell, s, t):
+    """Return the slopes along x and y, and the height, of a cell's surface at a place in it."""
+    slope_x = np.array([1.0 - t, t]) @ (corners[1] - corners[0]) / cell[0]
+    slope_y = np.array([1.0 - s, s]) @ (corners[:, 1] - corners[:, 0]) / cell[1]
+    return np.array([slope_x, slope_y]), np.array([1.0 - s, s]) @ corners @ np.array([1.0 - t, t])

@@ -1,10 +1,18 @@
-"""The specification of a sphere on a height field: nearest points of cells, found by a fixed number of steps."""
+"""The specification of a sphere on a height field: nearest points of cells, found by a fixed number of steps.
+
+The steps are Newton's, held inside of the cell. In a cell that is strongly bent a sphere beside a ridge has two places
+that are nearest to those around them: the search begins half way to the middle of the cell, and takes more steps.
+"""
 
 import numpy as np
 
-from .field_cells import cell_corners
+from .field_cells import cell_corners, over_cell, twist_of
 
-STEPS, REACH, APART = 2, 0.71, 0.94  # steps in a cell; sine of 45 degrees; cosine of 20 degrees
+STEPS, MORE = 2, 4  # in a cell, and in one that is strongly bent
+STRONG = 0.2  # how far a corner of such a cell is from the plane of the others, of the cell's size, at least
+DEFINITE = 0.9  # of what makes the distance no longer rise in all directions, the coupling that counts at most
+REACH, APART = 0.71, 0.94  # sine of 45 degrees; cosine of 20 degrees
+PLACE = 7  # numbers of a place that a search finds
 NEARER = 1.0 - 1e-6  # of a square of a distance: what is less far counts as nearer than an earlier cell
 
 
@@ -18,17 +26,24 @@ def nearest_points(field, centre, radius, number=0, both=True):
     h, cell = field.heights.reshape(-1, *field.heights.shape[-2:])[number], np.array(field.cells)
     start = centre - np.array(field.origin)
     ring = 1 if REACH * radius <= 0.5 * cell.min() else 2
-    *cells, there = find_cells(h, start, cell, ring, both)
     at = np.clip(start[:2] / cell, -ring, np.array(h.shape) - 1.0 + ring)
-    chosen = [np.array(cells[:2], dtype=int), np.array(cells[2:], dtype=int)][: 2 if both and there else 1]
-    surfaces = [_foot(cell_corners(h, (i, j)), (at - (i, j)) * cell, start[2], cell, STEPS + 1) for i, j in chosen]
+    surfaces = []
+    for there, *found in np.reshape(find_cells(h, start, cell, ring, both), (2, PLACE)):
+        if there:
+            first, place, free = np.split(np.array(found), [2, 4])
+            corners, inside = cell_corners(h, first.astype(int)), (at - first) * cell
+            _, A, b = _least(corners, cell, inside, start[2], place)
+            move = np.linalg.solve(np.where(np.outer(free, free) + np.eye(2) > 0.0, A, 0.0), b)
+            surfaces.append(_away(corners, cell, inside, start[2], place + free * move))
     above = surfaces[0][1]
     signed = [(up if above else -up, np.linalg.norm(up) if above else -np.linalg.norm(up)) for up, _ in surfaces]
     return [(up / abs(distance), radius - distance) for up, distance in signed]
 
 
 def find_cells(heights, centre, cell, ring, both):
-    """Return i, j of the cell that is nearest to a centre, of the second one, and whether that is there.
+    """Return a place in the cell that is nearest to a centre, and a second one [2 PLACE].
+
+    Each is whether it is there; i, j of the cell; x and y from there [m]; whether it may move along x and y.
 
     Args:
         heights: of one field [i, j]. centre: from its first point [m]. ring: how many cells to each side are tried.
@@ -43,15 +58,17 @@ def find_cells(heights, centre, cell, ring, both):
         for j in range(-ring, ring):
             first = (np.floor(at + 0.5) + np.array((i, j))).astype(int)
             found.append((first, cell_corners(heights, first), (at - first) * cell))
-    feet = [_foot(*each[1:], centre[2], cell, STEPS) for each in found]
-    best = _first_nearest([away @ away for away, _ in feet])
-    away, above = _foot(*found[best][1:], centre[2], cell, STEPS + 1)
+    feet = [_foot(*each[1:], centre[2], cell) for each in found]
+    best = _first_nearest([foot[0] @ foot[0] for foot in feet])
+    away, above, *_ = feet[best]
     far = [
         other @ other if up and other @ away < APART * np.linalg.norm(other) * np.linalg.norm(away) else np.inf
-        for other, up in feet
+        for other, up, *_ in feet
     ]
-    there = bool(both and above and np.isfinite(min(far)))
-    return [*found[best][0], *(found[_first_nearest(far)][0] if there else (0, 0)), float(there)]
+    second = _first_nearest(far)
+    numbers = lambda n: [*found[n][0], *feet[n][2], *feet[n][3]]  # noqa: E731
+    there = both and above and np.isfinite(far[second])
+    return [1.0, *numbers(best), *([1.0, *numbers(second)] if there else [0.0] * PLACE)]
 
 
 def _first_nearest(squares):
@@ -63,28 +80,42 @@ def _first_nearest(squares):
     return best
 
 
-def _foot(corners, inside, z, cell, steps):
-    """Return the vector from the nearest point of a cell to the centre, and whether that is above the surface.
+def _foot(corners, inside, z, cell):
+    """Return the vector from the nearest point of a cell to the centre, whether that is above, the point, and freedoms.
 
-    ``inside``: x and y of the centre from the first corner [m].
+    ``inside``: x and y of the centre from the first corner [m]. The point is likewise; it may move along an axis where
+    it is inside of the cell, and along none where the distance does not rise in all directions.
     """
+    place, strong = np.clip(inside, 0.0, cell), abs(twist_of(corners)) > STRONG * cell.min()
+    if strong:
+        place = 0.5 * place + 0.25 * cell
+    for _ in range(MORE if strong else STEPS):
+        _, A, b = _least(corners, cell, inside, z, place)
+        move = np.linalg.solve(A, b)
+        there = np.clip(place + move, 0.0, cell)
+        for k in (0, 1):  # along one axis alone, where the cell ends along the other
+            if there[1 - k] != (place + move)[1 - k]:
+                there[k] = np.clip(place[k] + (b[k] - A[0, 1] * (there - place)[1 - k]) / A[k, k], 0.0, cell[k])
+        place = there
+    definite, *_ = _least(corners, cell, inside, z, place)
+    free = (place > 0.0) & (place < cell) & definite
+    return *_away(corners, cell, inside, z, place), place, free.astype(float)
 
-    def surface(p):
-        s, t = p / cell
-        height = np.array([1.0 - s, s]) @ corners @ np.array([1.0 - t, t])
-        slope = np.array([np.array([1.0 - t, t]) @ (corners[1] - corners[0]),
-                          np.array([1.0 - s, s]) @ (corners[:, 1] - corners[:, 0])]) / cell  # fmt: skip
-        return height, slope
 
-    p = np.clip(inside, 0.0, cell)
-    for step in range(steps):
-        height, slope = surface(p)
-        A, b = np.eye(2) + np.outer(slope, slope), inside - p + (z - height) * slope
-        one, other = (0, 1) if step % 2 == 0 else (1, 0)
-        move = np.zeros(2)
-        move[one] = np.clip(p[one] + np.linalg.solve(A, b)[one], 0.0, cell[one]) - p[one]
-        move[other] = (b[other] - A[other, one] * move[one]) / A[other, other]
-        p = np.clip(p + move, 0.0, cell)
-    height, slope = surface(p)
-    away = np.array([*(inside - p), z - height])
+def _least(corners, cell, inside, z, place):
+    """Return whether half the square of a distance rises in all directions, its second and minus its first derivatives.
+
+    Of the distance from a place in a cell to a centre. The coupling of both directions is at most DEFINITE.
+    """
+    slope, height = over_cell(corners, cell, *(place / cell))
+    A = np.eye(2) + np.outer(slope, slope)
+    most, both = DEFINITE * np.sqrt(A[0, 0] * A[1, 1]), A[0, 1] - (z - height) * twist_of(corners) / (cell[0] * cell[1])
+    A[0, 1] = A[1, 0] = np.clip(both, -most, most)
+    return abs(both) <= most, A, inside - place + (z - height) * slope
+
+
+def _away(corners, cell, inside, z, place):
+    """Return the vector from a place in a cell to a centre, and whether that is above."""
+    slope, height = over_cell(corners, cell, *(place / cell))
+    away = np.array([*(inside - place), z - height])
     return away, away[2] > slope @ away[:2]

@@ -36,7 +36,7 @@ COST = {  # floating-point operations of a statement
     "search": 1,
     "floor": 1,
 }
-SEARCHED, NORMAL = 20, 3  # numbers of a search in a field or over a plane, before what a shape lists
+SEARCHED, NORMAL = 21, 3  # numbers of a search in a field or over a plane, before what a shape lists
 COST_ELSE = 8  # of the other statements: sines, roots and reciprocals take about as long as 8 additions
 
 

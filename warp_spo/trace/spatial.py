@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
-from .scalars import Value, absolute, is_constant
+from .scalars import Value, absolute, inverse_root, is_constant, less, select
 
 
 def total(values: Iterable[Value]) -> Value:
@@ -55,6 +55,12 @@ ZERO = Vector((0.0, 0.0, 0.0))
 
 def dot(a: Iterable[Value], b: Iterable[Value]) -> Value:
     return total(x * y for x, y in zip(a, b, strict=True))
+
+
+def norm(a: Sequence[Value]) -> Value:
+    """Return the length of a vector."""
+    square = dot(a, a)
+    return square * inverse_root(select(less(0.0, square), square, 1.0))
 
 
 def cross(a: Sequence[Value], b: Sequence[Value]) -> Vector:

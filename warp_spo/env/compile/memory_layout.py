@@ -79,17 +79,13 @@ class MemoryLayout:
         scene: Scene,
         default_q: np.ndarray,
         step_dt: float,
+        dt: float,
         commands: Any,
         values: tuple[str, ...],
         guard: Guard,
     ):
-        self.scene, self.default_q, self.step_dt, self.commands, self.values = (
-            scene,
-            default_q,
-            step_dt,
-            commands,
-            values,
-        )
+        self.scene, self.default_q, self.step_dt, self.dt = scene, default_q, step_dt, dt
+        self.commands, self.values = commands, values
         self.guard = guard
         self.action_count = 0
         self.action_arrays: set[str] = set()

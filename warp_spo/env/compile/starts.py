@@ -66,7 +66,7 @@ def contact_reports(w: World) -> dict[tuple[str, int], Value]:
         trace.place(link)
     laws = JointLaws(trace.links, 0.0, trace.vector("q"), trace.vector("qd"))
     found: dict[tuple[str, int], Value] = {}
-    for point in place_points(trace, laws, trace.vector("qd")):
+    for point in place_points(trace, laws, trace.vector("qd"), ahead=w._layout.dt):
         gap, number = point.gap, point.number
         if ("contact_gap", number) in found:  # its second surface; the first one's slip counts, as in a step
             first = found["contact_gap", number]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...kernels.tensor_networks import BOUNDED, MOST_INPUTS, MOST_UNITS, SCALE, Shape
+from ...kernels.tensor_networks import BOUNDED, MOST_INPUTS, MOST_UNITS, SCALE, NetworkShape
 
 if TYPE_CHECKING:
     from ..actuator_nets import ActuatorNetwork
@@ -15,7 +15,7 @@ WEIGHTS = 9  # scaled weights are at most two to this power
 LANES = np.arange(32)
 
 
-def shape_of(network: ActuatorNetwork) -> Shape | None:
+def shape_of(network: ActuatorNetwork) -> NetworkShape | None:
     """Return the shape of a network that tensor cores can evaluate as accurately as float32, None of others."""
     layers = network.layers
     units = tuple(-(-len(biases) // 16) * 16 for _, biases in layers[:-1])
@@ -23,10 +23,10 @@ def shape_of(network: ActuatorNetwork) -> Shape | None:
     if not units or network.activation not in BOUNDED or max(units) > MOST_UNITS or inputs > MOST_INPUTS:
         return None
     scales = [1.0, *(SCALE * 2.0 ** _power(w) for w, _ in layers[1:-1])]
-    return Shape(inputs, units, network.activation, tuple(scales))
+    return NetworkShape(inputs, units, network.activation, tuple(scales))
 
 
-def pack(network: ActuatorNetwork, shape: Shape) -> np.ndarray:
+def pack(network: ActuatorNetwork, shape: NetworkShape) -> np.ndarray:
     """Return the array of weights, float32, some of whose words are two float16."""
     found, before = [], -(-shape.inputs // 8) * 8
     for layer, (units, scale) in enumerate(zip(shape.units, shape.scales, strict=True)):

@@ -2,11 +2,10 @@
 
 A sphere touches where the surface is nearest to its centre c, in the direction from there to c. The cells around the
 grid point nearest to c are tried, two along each axis, or four where the radius is large beside the cell; beyond an
-edge they are level across it. In each the nearest point of its bilinear surface is found by Gauss and Newton from the
-place next to c: with slopes g and the height's error w there, the move u of least |e - u|^2 + (w - g . u)^2, where e
-leads to c, kept inside of the cell. The nearest cell's point is found again, with a step more, so that its derivatives
-are those of that cell's heights alone. Which cell that is a search in native code says, see
-:mod:`warp_spo.reference.field_grid`.
+edge they are level across it. In each the nearest point of its bilinear surface is found by Newton's steps, held
+inside of the cell. That is a search in native code, see :mod:`warp_spo.reference.field_grid`, which says the cell and
+the place in it. A further step from there, along the axes along which the place is not at the end of the cell, is
+taken here, so that derivatives are those of the nearest point.
 
 Where a field has walls or creases a sphere may touch a second point: the nearest one that lies in another direction.
 """
@@ -20,8 +19,9 @@ from ...trace.scalars import Graph, Value, floor, inverse_root, less, reciprocal
 from ...trace.spatial import Vector, dot
 from .ground import GROUND, Corners, Edges, GroundOffset, Surface, clamp
 
-SPHERE, FOUND = "sphere", 5  # the search and how many numbers it finds: i, j of two cells, whether the second counts
-STEPS = 2  # of Gauss and Newton in each cell; the nearest one takes one more
+SPHERE, PLACE = "sphere", 7
+"""The search, and how many numbers each of two places has: whether it is there, i, j of its cell, x and y from there
+[m], and whether it may move along x and y."""
 REACH = 0.71  # sine of the steepest slope, 45 degrees, whose nearest point is among the cells for sure
 TINY = 1e-20  # square of a distance [m^2] that has no direction
 
@@ -63,53 +63,50 @@ def sphere_surfaces(
     radius: Value,
     cells: int,
     second: bool,
+    below: Value,
 ) -> list[Surface]:
     """Return the surfaces that a sphere may touch, ``centre`` in inertial axes [m].
 
-    ``cells``: see :func:`ring`. ``second``: whether there may be two.
+    ``cells``: see :func:`ring`. ``second``: whether there may be two. ``below``: how far below the centre [m] the field
+    matters; what is lower may be taken for farther than it is.
     """
     (size_x, size_y), (rows, columns) = ground.cells, ground.heights.shape[-2:]
     x, y, z = (at - a - b for at, a, b in zip(centre, place.origin, ground.origin, strict=True))
     first: Value = 0.0
     if ground.count > 1:
         first = floor(clamp(place.field, ground.count - 1.0)) * float(rows * columns)
-    asked = [first, x, y, z, size_x, size_y, float(rows), float(columns), float(cells), float(second)]
-    *found, there = search(graph, GROUND, SPHERE, asked, FOUND)
+    asked = [first, x, y, z, size_x, size_y, float(rows), float(columns), float(cells), float(second), below]
+    found = search(graph, GROUND, SPHERE, asked, 2 * PLACE)
     at_x = clamp(x * (1.0 / size_x), rows - 1.0 + cells, -float(cells))
     at_y = clamp(y * (1.0 / size_y), columns - 1.0 + cells, -float(cells))
 
-    def surface(i: Value, j: Value, near: Value | None) -> Surface:
+    def surface(i: Value, j: Value, *where: Value, near: Value | None) -> Surface:
         read = Corners.of(graph, ground, place, clamp(i, rows - 2.0), clamp(j, columns - 2.0))
         corners = read.levelled(Edges.of(i, j, rows - 1, columns - 1))
         cell = Cell(corners, (at_x - i) * size_x, (at_y - j) * size_y)
-        return _surface(read, _foot(cell, z, size_x, size_y, STEPS + 1), radius, near)
+        return _surface(read, _foot(cell, z, size_x, size_y, *where), radius, near)
 
     if not second:
-        return [surface(found[0], found[1], None)]
-    return [surface(found[0], found[1], 1.0), surface(found[2], found[3], less(0.5, there))]
+        return [surface(*found[1:PLACE], near=None)]
+    return [surface(*found[1:PLACE], near=1.0), surface(*found[PLACE + 1 :], near=less(0.5, found[PLACE]))]
 
 
-def _foot(cell: Cell, z: Value, size_x: float, size_y: float, steps: int) -> Foot:
-    """Return the nearest point of a cell to a centre at the height ``z``."""
+def _foot(
+    cell: Cell, z: Value, size_x: float, size_y: float, s: Value, t: Value, along_x: Value, along_y: Value
+) -> Foot:
+    """Return the nearest point of a cell to a centre at the height ``z``: a step of Newton's from (s, t).
+
+    ``along_x``, ``along_y``: 1 where it may move so, else 0.
+    """
     corners, x, y = cell
     run, rise = corners.run * (1.0 / size_x), corners.rise * (1.0 / size_y)
     twist, above = corners.twist * (1.0 / (size_x * size_y)), z - corners.base
-    s, t = clamp(x, size_x), clamp(y, size_y)
-    for step in range(steps):
-        a, b = run + twist * t, rise + twist * s
-        w = above - run * s - b * t
-        right_x, right_y = (x - s) + a * w, (y - t) + b * w
-        along_x, along_y = a * a + 1.0, b * b + 1.0
-        both = a * b
-        inverse = reciprocal(along_x + b * b)
-        if step % 2 == 0:
-            next_s = clamp(s + (along_y * right_x - both * right_y) * inverse, size_x)
-            t = clamp(t + (right_y - both * (next_s - s)) * reciprocal(along_y), size_y)
-            s = next_s
-        else:
-            next_t = clamp(t + (along_x * right_y - both * right_x) * inverse, size_y)
-            s = clamp(s + (right_x - both * (next_t - t)) * reciprocal(along_x), size_x)
-            t = next_t
+    a, b = run + twist * t, rise + twist * s
+    w = above - run * s - b * t
+    right_x, right_y = along_x * ((x - s) + a * w), along_y * ((y - t) + b * w)
+    square_x, square_y, both = a * a + 1.0, b * b + 1.0, (along_x * along_y) * (a * b - w * twist)
+    inverse = reciprocal(square_x * square_y - both * both)
+    s, t = s + (square_y * right_x - both * right_y) * inverse, t + (square_x * right_y - both * right_x) * inverse
     a, b = run + twist * t, rise + twist * s
     away = Vector((x - s, y - t, above - run * s - b * t))
     return Foot(away, dot(away, away), less(0.0, away[2] - a * away[0] - b * away[1]))

@@ -102,12 +102,13 @@ def surfaces(
     then = Edges.of(next_x, next_y, rows, columns)
     cell = read.levelled(Edges(*(select(steep, a, b) for a, b in zip(edges, then, strict=True))))
     s, t = (i + s) - select(steep, i, next_i), (j + t) - select(steep, j, next_j)
-    run, rise = cell.run + 0.5 * cell.twist, cell.rise + 0.5 * cell.twist
+    in_s, in_t = clamp(s, 1.0), clamp(t, 1.0)
+    run, rise = cell.run + in_t * cell.twist, cell.rise + in_s * cell.twist
     wall = upward_normal(run * rate_x, rise * rate_y)
-    middle = cell.mean + run * (s - 0.5) + rise * (t - 0.5)
+    plane = cell.base + run * s + rise * t - cell.twist * (in_s * in_t)
     rises = select(steep, 1.0, less(0.0, run * rate_x * moves[0] + rise * rate_y * moves[1]))
     there = rises * less(STEEP * STEEP, cell.steepness(rate_x, rate_y)) * (1.0 - less(cell.highest, z))
-    return [bottom, Surface(wall, select(there, (middle - z) * wall[2], AWAY), read, there)]
+    return [bottom, Surface(wall, select(there, (plane - z) * wall[2], AWAY), read, there)]
 
 
 def upward(graph: Graph, ground: HeightField, at: list[Value], place: GroundOffset) -> Vector:

@@ -34,7 +34,7 @@ from ...scene.ground import AWAY, HEIGHTS, PLACE, HeightField, Listed
 from ...scene.scene import Scene
 from ...scene.supports import CORNER, HULL_CORNER
 from ...trace.scalars import Entry, Value, absolute, branch, is_constant, less, lost, reciprocal, select
-from ...trace.spatial import IDENTITY, ZERO, Twist, Vector, cross, dot, total
+from ...trace.spatial import IDENTITY, ZERO, Twist, Vector, cross, dot, norm, total
 from ..kinematics import arm_on_link, carried_velocity, frame_on_link, zero
 from ..model import effective_mass
 from ..model.links import Link, Links
@@ -56,6 +56,8 @@ if TYPE_CHECKING:
 
 ARMS = 8  # spheres of a segment up to which their arms are kept, see docs/contact_measured.md
 STANDING = (0.0, 0.0, 1.0)  # normal of the ground in a body's frame for which weights of points that move are taken
+FASTER, REACHES = 5.0, 2.0  # speed that a step may add to a shape's [m/s]; way per speed and step that is looked down
+SEEN = 5.0  # radii below a sphere's centre within which gaps are those of the nearest point
 SLIP = 0.6  # share of a point's inverse weight by which friction beyond its bound predicts slip
 
 
@@ -157,18 +159,23 @@ def place_points(
     qd: Entry,
     oriented: bool = False,
     branches: bool = False,
+    gaps: bool = True,
+    ahead: Value | None = None,
     carry: Callable[[Link, ContactLinkMotion], ContactLinkMotion] | None = None,
 ) -> list[TracedContactPoint]:
     """Return the contact points that a trace works on, one for each surface that a point may touch.
 
     ``oriented``: with the inertial directions x, y, z in the axes of their links. ``branches``: code may leave out
-    points where their surface is not near. ``carry``: returns what points and further links read of a link, on the way
-    to any point of the scene; None: what was computed.
+    points where their surface is not near. ``gaps``: of spheres over a field are distances to the nearest point up to
+    SEEN radii; beyond, they are vertical, as all are without it that the step cannot close. ``ahead``: the time [s]
+    within which shapes have to touch the grid of a field to be seen there; the step's if left out. ``carry``: returns
+    what points and further links read of a link, on the way to any point of the scene; None: what was computed.
     """
     scene = trace.links.scene
     ground, weights = scene.ground, inverse_weights(scene)
     assert ground is not None
     half_way, still = KICK in trace.inputs, (ZERO, ZERO)
+    ahead = joint_laws.h if ahead is None else ahead
     path = trace.vector(PATH) if half_way else qd
     place_of_ground = ground_offset(joint_laws)
     seats = {at: _contact_placement(trace, at, body, place) for at, body, place in _point_positions(trace, joint_laws)}
@@ -197,7 +204,8 @@ def place_points(
             assert isinstance(ground, HeightField) and point.support is not None
             if point.contact not in searches:
                 at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
-                shape = _shape_over(trace, number, ground, place_of_ground, at, toward, radius)
+                below = _way_down(mine.travel, centre, total(_support_values(trace, number)[1]), ahead)
+                shape = _shape_over(trace, number, ground, place_of_ground, at, toward, radius, below)
                 searches[point.contact] = shape, find(trace.graph, ground, place_of_ground, shape)
             shape, rows = searches[point.contact]
             row = rows[ROW * point.support.number : ROW * (point.support.number + 1)]
@@ -249,8 +257,10 @@ def place_points(
             touched = [grid.surface]
         elif rolls and isinstance(ground, HeightField):
             second = surface_count(ground, place_of_ground.varies, point.walls, rolls) == 2
-            cells = ring(ground, point.radius)
-            touched = sphere_surfaces(trace.graph, ground, at, place_of_ground, radius, cells, second)
+            cells, below = ring(ground, point.radius), radius + _way_down(mine.travel, centre, radius, ahead)
+            if gaps:
+                below = select(less(below, SEEN * radius), SEEN * radius, below)
+            touched = sphere_surfaces(trace.graph, ground, at, place_of_ground, radius, cells, second, below)
         else:
             touched = surfaces(trace.graph, ground, at, place_of_ground, moves, point.walls)
         for normal, depth, cell, near in touched:
@@ -341,14 +351,27 @@ def _shape_over(
     middle: list[Value],
     toward: list[Vector],
     radius: Value,
+    below: Value = 0.0,
 ) -> Shape:
-    """Return the shape of a point over a field; ``middle``: of the shape, ``toward``: the inertial axes in its link."""
+    """Return the shape of a point over a field; ``middle``: of the shape, ``toward``: the inertial axes in its link.
+
+    ``below``: by how much the field may be below it [m].
+    """
     support = trace.links.scene.contact_points[number].support
     assert support is not None
     axes, sizes, _ = _support_values(trace, number)
     centre = Vector(x - place.origin[c] - ground.origin[c] for c, x in enumerate(middle))
     turned = [Vector(dot(way, axis) for way in toward) for axis in axes]
-    return Shape(support.kind, centre, turned, sizes, radius, support.table)
+    return Shape(support.kind, centre, turned, sizes, radius, below, support.table)
+
+
+def _way_down(twist: Twist, middle: Vector, size: Value, time: Value) -> Value:
+    """Return how far below a shape [m] the ground may be that it touches within a time [s].
+
+    ``twist``: of its link. ``middle``: of the shape in the link. ``size``: how far the shape reaches from there [m].
+    """
+    w, v = twist
+    return time * (REACHES * (norm(v + cross(w, middle)) + norm(w) * size) + FASTER)
 
 
 def _place_support(trace: Trace, number: int, normal: Vector) -> SupportPlacement:

@@ -72,7 +72,8 @@ class ContactStepTrace(Step):
         points, states, candidates = [], [], []
         alone = trace.exchange.alone  # segments side by side are for GPUs, where branches cost more than they spare
         oriented = not AXES_ASKED.isdisjoint(self.reports)
-        for raw in place_points(trace, self.joint_laws, self.qd, oriented, branches=alone):
+        gaps = "contact_gap" in self.reports
+        for raw in place_points(trace, self.joint_laws, self.qd, oriented, branches=alone, gaps=gaps):
             first = self._first(raw)
             point, (across, candidate, *turning) = raw.restrict_to_near(first.across, first.candidate, *first.turning)
             points.append(point)
@@ -103,8 +104,8 @@ class ContactStepTrace(Step):
         forces = self._forces(points, states, alpha, excess)
         for number, surfaces in forces.items():
             self._report(number, surfaces)
-        gaps = self.finished.get("contact_gap", ())
-        phases.add_invariants(item.value for item in gaps)  # of the state before the step
+        before = self.finished.get("contact_gap", ())
+        phases.add_invariants(item.value for item in before)  # of the state before the step
         if status or "contact_excess" in self.reports:
             trace.graph.step = "excess|e"
             self.excess = [self._last(largest(values)) for values in (*excess[:2], efforts, excess[2])]
