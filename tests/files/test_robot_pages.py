@@ -245,6 +245,7 @@ def test_flexible_bodies_bend_to_the_bodies_that_they_carry():
             handle.value = random.uniform(0.5 * handle.min, 0.5 * handle.max)
         page.tick()
         assert page.bent.bodies == [0, 1, 2]
+        assert {body for body, _ in page.layers["what the file draws"].handles} == {3}  # no straight bone over a line
         for number, body in enumerate(page.bent.bodies):
             line = page.bent.points(number, page.q, page.poses)
             assert np.allclose(line[0], page.poses[body, :3]) and np.allclose(line[-1], page.poses[body + 1, :3])

@@ -354,7 +354,10 @@ def view(robot: Any, host: str = HOST, port: int = PORT, contacts: Any = None, *
 
     load_viser()
     if isinstance(robot, Scene):
-        return RobotView(robot, scene_appearance(robot), "scene", host=host, port=port)
+        look = scene_appearance(robot)
+        points = [body.modes is not None and body.modes.points is not None for body in robot.bodies]
+        bones = [each for each in look.drawn if not points[each.body]]  # a straight bone would hide the bent line
+        return RobotView(robot, look._replace(drawn=bones), "scene", host=host, port=port)
     if isinstance(robot, str | Path):
         file = Path(robot)
         scene, notes, has_ground = load_with_notes(file, contacts, options)
