@@ -136,6 +136,39 @@ def test_a_signal_ends_a_training_with_a_checkpoint(number, tmp_path, monkeypatc
     assert [row["iteration"] for row in training_log.read_rows(tmp_path / "progress.jsonl")] == [0, 1, 2, 3]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_training_of_two_processes_with_a_checkpoint(number, tmp_path):
+    """The launcher passes it on; both end after the same iteration, and leave no process behind."""
+    given = [
+        "cartpole",
+        "--worlds",
+        "4",
+        "--device",
+        "cpu",
+        "--gpus",
+        "2",
+        "--iterations",
+        "900",
+        "--out",
+        str(tmp_path),
+    ]
+    command = [sys.executable, "-m", "warp_spo.train", *given]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    rows, ends = tmp_path / "progress.jsonl", time.monotonic() + 300.0
+    while (
+        process.poll() is None and time.monotonic() < ends and not (rows.exists() and rows.read_text().count("\n") > 2)
+    ):
+        time.sleep(0.1)
+    process.send_signal(number)
+    said, _ = process.communicate(timeout=120.0)
+    assert process.returncode == 128 + number, said
+    last = int(training_log.read_rows(rows)[-1]["iteration"])
+    assert torch.load(tmp_path / "last.pt", weights_only=True)["iter"] == last
+    assert f"stopped after iteration {last}: " in said.splitlines()[-1]
+    assert said.count("stopped after iteration") == 1
+
+
 def test_a_signal_reaches_those_who_call_train(tmp_path, monkeypatch):
     interrupt(monkeypatch, 1, signal.SIGINT)
     with pytest.raises(KeyboardInterrupt, match="train: stopped after iteration 1: Ctrl-C"):
