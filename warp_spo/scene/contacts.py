@@ -56,8 +56,9 @@ class Contact(ShapeArguments):
         eps: speed [m/s] below which friction is a damper. A point that sticks creeps by less than that. Torsional and
             rolling friction are dampers below eps over the length with which the point's body turns as easily as the
             point moves in the neutral pose: 0.63 radii of a free sphere.
-        walls: on a height field, cells steeper than 45 degrees are a wall and a floor for the points; False: the slopes
-            that they are, where a wall matters little, for about half the operations of such a point.
+        walls: on a height field, cells steeper than 45 degrees are a wall and a floor for the points, and faces and
+            edges touch the field's tops and ridges; False: points alone touch it, and see the slopes that cells are.
+            That takes half the operations of such a point and no search, and is enough where the shape seldom touches.
         label: name in tables and errors.
 
     Raises:
@@ -107,7 +108,7 @@ class Contact(ShapeArguments):
             found += [((x, y, z), None) for x, y, z in self.positions.tolist()]
         else:
             found += [((*middle.tolist(),), support) for support in moving]
-        if isinstance(ground, HeightField):
+        if isinstance(ground, HeightField) and self.walls:
             middle, grid = self.shape.grid_supports()
             found += [((*middle.tolist(),), support) for support in grid]
         return found
