@@ -36,7 +36,7 @@ def test_reports_have_shapes_and_kinds(case, kind):
     like = {"numpy": q, "torch": torch.as_tensor(q, device=where), "warp": None}[kind]
     report = dyn.step_report(*NAMES, like=like)
     points = dyn.scene.contact_count
-    shapes = [(6,), (1, 7), (1, 6), (points, 3), (points,), (points,), (3,), (points, 3), ()]
+    shapes = [(6,), (1, 7), (1, 6), (points, 3), (points,), (points,), (3,), (points, 3)]
     assert tuple(report) == NAMES and len(report) == len(shapes)
     for name, shape in zip(NAMES, shapes, strict=True):
         array = report[name]

@@ -124,7 +124,7 @@ def touched(shape, field, cell, centre, axes, sizes, radius, row):
     corners, corner = cell_corners(field, first), np.array([*first * cell, field[first]])
     if kind == RIMS:
         place = RimPlace(corners, cell, first, centre, axes, sizes, *row[3:6])
-        at = centre + place.seat - sizes[0] * row[6] * place.grade * place.way
+        at = centre + place.offset - sizes[0] * row[6] * place.grade * place.way
         return _under(corners, cell, first, at, radius)
     if shape == "capsule" or kind > SIDE:
         size = sizes[0] if shape == "capsule" else sizes[0] + radius

@@ -94,7 +94,7 @@ def _on_rim(field, cell, centre, axes, sizes, edge, end, sides):
         place = at(angle)
         if not place.curve < -FLAT:
             continue
-        n, depth = in_cell(corners, cell, *place.part, (centre + place.seat)[2])
+        n, depth = in_cell(corners, cell, *place.part, (centre + place.offset)[2])
         if n[2] >= STEEPEST and place.out @ n <= BESIDE and end * (axes[2] @ n) <= BESIDE:
             q = np.cos(angle) * out + np.sin(angle) * local
             row = [RIMS, i, j, end, q[0], q[1], 1.0 / place.curve, 0.0, 0.0]
@@ -106,14 +106,14 @@ class RimPlace:
     """A place on a rim over a cell.
 
     Attributes:
-        seat: from the cylinder's middle. out, way: away from the axis, and along the rim. part: where in the cell.
+        offset: from the cylinder's middle. out, way: away from the axis, and along the rim. part: where in the cell.
         grade: how steeply the rim falls into the ground. curve: how that changes along the rim, times the radius.
     """
 
     def __init__(self, corners, cell, first, centre, axes, sizes, end, cos, sin):
         self.out, self.way = axes.T @ [cos, sin, 0.0], axes.T @ [-sin, cos, 0.0]
-        self.seat = end * sizes[2] * axes[2] + sizes[0] * self.out
-        self.part = (centre + self.seat)[:2] / cell - first
+        self.offset = end * sizes[2] * axes[2] + sizes[0] * self.out
+        self.part = (centre + self.offset)[:2] / cell - first
         slope, _ = over_cell(corners, cell, *self.part)
         twist = 2.0 * twist_of(corners) / (cell[0] * cell[1])
         self.grade = slope @ self.way[:2] - self.way[2]

@@ -87,7 +87,7 @@ class RobotView:
             "collision shapes": BodyLayer(self.page, "collision", appearance.collision, opacity=0.5, visible=False),
         }
         self.overlays = Overlays(self.page, scene, self.size)
-        self.bent = BentBodies(self.page, scene)
+        self.flexible = BentBodies(self.page, scene)
         self.arrows = Arrows(self.page, "forces", ORANGE, self.size)
         self._ground_name, self._own_ground = OWN, ground
         self.page.show_ground(ground)
@@ -115,7 +115,7 @@ class RobotView:
                     self.boxes[name] = gui.add_checkbox(name, layer.visible)
             for name in self.overlays.names:
                 self.boxes[name] = gui.add_checkbox(name, False)
-            if self.bent.handle is not None:
+            if self.flexible.handle is not None:
                 self.boxes["bent shapes"] = gui.add_checkbox("bent shapes", True)
             self.boxes["contact forces"] = gui.add_checkbox("contact forces", True)
             self.boxes["follow"] = gui.add_checkbox("follow the robot", len(moving_trees(self.scene)) == 1)
@@ -227,9 +227,9 @@ class RobotView:
         for name in self.overlays.names:
             if self.overlays.shown.get(name, False) != self.boxes[name].value:
                 self.overlays.show(name, self.boxes[name].value)
-        if self.bent.handle is not None and self.bent.handle.visible != self.boxes["bent shapes"].value:
-            self.bent.handle.visible = self.boxes["bent shapes"].value
-            self.bent.place(self.q, self.poses)
+        if self.flexible.handle is not None and self.flexible.handle.visible != self.boxes["bent shapes"].value:
+            self.flexible.handle.visible = self.boxes["bent shapes"].value
+            self.flexible.place(self.q, self.poses)
         self.arrows.visible = self.boxes["contact forces"].value
         if self.ground.value != self._ground_name and self.motion is not None:
             self._begin()
@@ -300,7 +300,7 @@ class RobotView:
         for layer in self.layers.values():
             layer.place(self.poses[None])
         self.overlays.place(self.poses)
-        self.bent.place(self.q, self.poses)
+        self.flexible.place(self.q, self.poses)
         if self.boxes["follow"].value and floats(self.scene) and self.motion is not None:
             self.page.follow(self.poses[0, :2] - self._home)
         elif self.motion is None:
