@@ -244,13 +244,13 @@ def test_flexible_bodies_bend_to_the_bodies_that_they_carry():
         for handle in page.sliders.by_label.values():
             handle.value = random.uniform(0.5 * handle.min, 0.5 * handle.max)
         page.tick()
-        assert page.bent.bodies == [0, 1, 2]
+        assert page.flexible.bodies == [0, 1, 2]
         assert {body for body, _ in page.layers["what the file draws"].handles} == {3}  # no straight bone over a line
-        for number, body in enumerate(page.bent.bodies):
-            line = page.bent.points(number, page.q, page.poses)
+        for number, body in enumerate(page.flexible.bodies):
+            line = page.flexible.points(number, page.q, page.poses)
             assert np.allclose(line[0], page.poses[body, :3]) and np.allclose(line[-1], page.poses[body + 1, :3])
             assert np.linalg.norm(line[-1] - line[0]) > 5.0
-        sent = page.bent.handle.points
+        sent = page.flexible.handle.points
         assert np.allclose(sent[-1, 1], page.poses[3, :3], atol=1e-5)  # float32, within 40 m
     finally:
         page.close()
