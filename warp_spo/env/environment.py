@@ -76,7 +76,7 @@ class Env(VecEnv):
         seed: of all random numbers, 64 bits.
         first_world: number of world 0 in a run on several devices; a world's numbers depend on its own number alone.
         passes: of steps with contacts, see :meth:`Dynamics.step`.
-        granularity: of the dynamics.
+        granularity, pair_solver: of the dynamics, see :class:`warp_spo.Dynamics`.
         graph: whether a step is one CUDA graph; None: on CUDA it is.
         final_observations: whether ``extras["final_observations"]`` holds what was observed after the step and before
             new starts, the last observation of worlds whose episode has ended.
@@ -129,6 +129,7 @@ class Env(VecEnv):
         bounds: Bounds | None = None,
         cfg: Any = None,
         keep_failures: str | Path | None = None,
+        pair_solver: str | None = None,
     ):
         self._given = {name: value for name, value in locals().items() if name != "self"}
         self._alone: dict[tuple[int, ...], Env] = {}  # of one world, for replays of failures
@@ -152,7 +153,8 @@ class Env(VecEnv):
         self._layout.keeps_failures = keep_failures is not None
         tracing = self._trace(arguments.check_parts(actions), *terms, commands, events)
         variable = self._layout.values
-        self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable=variable, granularity=granularity)
+        options: dict[str, Any] = {"granularity": granularity, "pair_solver": pair_solver}
+        self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable, **options)
         store = self._store = self._allocate(tracing)
         self.q, self.qd, self.actions, self.chosen = (store.tensors[n] for n in ("q", "qd", "actions", "chosen"))
         self._tensors, self._controls, self._report = store.tensors, store.controls, StepReport(**store.written)

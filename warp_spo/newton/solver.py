@@ -15,6 +15,7 @@ from newton.solvers import SolverBase
 
 from ..dynamics.dynamics import Dynamics
 from ..dynamics.stepping.integrators import INTEGRATORS
+from ..dynamics.stepping.joint_space import check_pair_solver
 from ..dynamics.stepping.options import StepOptions, StepReport
 from ..errors import UnsupportedError, as_integer, as_names, never_copied, shown
 from ..kernels import declare, newton_arrays
@@ -111,7 +112,7 @@ class SolverSPO(MassMatrixInterface, SolverBase):
             them in one sweep a step. "multipliers" holds them by Lagrange multipliers, see
             :meth:`warp_spo.Dynamics.step`. "cut" ignores them.
         integrator: As in :meth:`warp_spo.Dynamics.step`. "midpoint" and "rk4" have no observables.
-        granularity: As in :class:`warp_spo.Dynamics`.
+        granularity, pair_solver: As in :class:`warp_spo.Dynamics`.
         contacts: "ground": the solver's own contacts of shapes with the ground. "pipeline": those that :meth:`step` is
             given. "none": contacts are left out, and a step that is given some says so. "auto": "ground" if the model
             has a level ground, no other shape that stands still, and only shapes that have points; else "pipeline" if
@@ -160,6 +161,7 @@ class SolverSPO(MassMatrixInterface, SolverBase):
         passes: int | None = None,
         substeps: int = 1,
         tune: bool = False,
+        pair_solver: str | None = None,
     ):
         if not hasattr(model, "particle_count"):
             raise TypeError(f"SolverSPO: model is of type {type(model).__name__}; expected a newton.Model")
@@ -180,7 +182,8 @@ class SolverSPO(MassMatrixInterface, SolverBase):
             raise ValueError(f"SolverSPO: substeps is {substeps!r}; expected an integer, 1 or more")
         self.integrator, self._tunes, self._substeps = integrator, tune, count
         self._contact_options, self._pairs_asked, self._passes = (contacts, points), pairs, passes
-        self._options: dict[str, Any] = {"loops": loops, "granularity": granularity}
+        check_pair_solver("SolverSPO", pair_solver)
+        self._options: dict[str, Any] = {"loops": loops, "granularity": granularity, "pair_solver": pair_solver}
         with paused_tape():
             made = self._build()
         warn_of_soft_shapes(model, points, *made)

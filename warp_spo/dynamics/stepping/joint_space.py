@@ -28,11 +28,13 @@ if TYPE_CHECKING:
 
 SYSTEM = Routine("joint_system", joint_system.joint_system)
 STATE_AFTER = Routine("joint_state_after", joint_system.state_after)
-FEW, MOST_SHARED = 8192, 96 * 1024
-"""Worlds up to which each takes a warp; shared memory of a block above which it does, too [bytes]. Not measured yet."""
+FEW, MOST_SHARED, NARROW = 8192, 96 * 1024, 16
+"""Worlds up to which each takes a warp, and shared memory of a block above which it does, too [bytes]; but half a warp
+where there are at most NARROW dofs, see docs/measured_facts.md."""
 ROOM = 227 * 1024  # shared memory of a block [bytes]
 MARGIN = 5e-3  # how near shapes are looked at whatever their speeds [m]; a drive at 1000 m/s^2 moves so far in 3 ms
 TINY = 1e-9  # radius of a point among shapes [m]
+PAIR_SOLVERS = ("joint space",)  # that a caller may ask for
 NO_ROOM = "more dofs and contacts than the shared memory of the GPU holds of a world"
 NO_ROOM_WAY = "use dtype='float32', or list fewer pairs"
 NEAR, NEAR_A_BODY = 256, 4
@@ -44,7 +46,15 @@ two others, mostly with four points. Where shared memory is short, LEAST slots, 
 
 def is_generated(dyn: Dynamics) -> bool:
     """Return whether generated code solves the pairs of bodies: they tie few links, or nothing can move."""
-    return dyn.scene.dof_count == 0 or coupled.is_supported(dyn.programs.builder.links)
+    if dyn.scene.dof_count == 0:
+        return True
+    return dyn.pair_solver is None and coupled.is_supported(dyn.programs.builder.links)
+
+
+def check_pair_solver(call: str, given: Any) -> None:
+    """Raise ValueError unless it names a solver of pairs of bodies, or None."""
+    if given not in (None, *PAIR_SOLVERS):
+        raise ValueError(f"{call}: pair_solver is {given!r}; expected None or {PAIR_SOLVERS[0]!r}")
 
 
 def choose_solver(dyn: Dynamics) -> JointSpaceStep | None:
@@ -130,7 +140,8 @@ class JointSpaceStep:
             sizes = sizes._replace(slots=slots + sizes.surfaces)
         self.tables = tables = tables._replace(sizes=sizes)
         crowded = 2 * joint_space.world_bytes(sizes, T) > MOST_SHARED
-        self.lanes = lanes or (32 if crowded or dyn.worlds <= FEW else 16)
+        narrow = scene.dof_count <= NARROW and not crowded
+        self.lanes = lanes or (32 if crowded or (dyn.worlds <= FEW and not narrow) else 16)
         array: Any = functools.partial(wp.array, dtype=T, device=self.device)
         make = lambda *shape, dtype=T: wp.zeros(shape, dtype=dtype, device=self.device)  # noqa: E731
         varies = any(self._varies(name) for name in (*joint_system.LAWS.values(), *joint_system.OTHERS))

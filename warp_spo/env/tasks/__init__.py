@@ -33,7 +33,7 @@ def task(name: str) -> Any:
 
 OPEN = (
     "first_world", "passes", "granularity", "graph", "log_interval", "final_observations", "bounds", "cfg",
-    "keep_failures",
+    "keep_failures", "pair_solver",
 )  # fmt: skip
 """Arguments of ``Env`` that tasks leave to the caller."""
 
