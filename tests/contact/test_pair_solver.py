@@ -4,9 +4,9 @@ import pickle
 
 import numpy as np
 import pytest
-from support.border import explained
 
 import warp_spo as spo
+from support.border import explained
 
 SIZE, TURN = 0.02, np.sin(np.pi / 8)  # half the width of rails and of the bar [m]; of a turn by 45 degrees
 
