@@ -57,13 +57,12 @@ def store(stores, known, found):
         found[item.array][(slice(None), *item.index)] = value
     worlds = len(known["q"])
     answers = [np.broadcast_to(value, worlds) for value in values[len(outputs) :]]
-    return np.array([two_digits(x) if of.op == "search" else x for of, x in zip(asked, answers, strict=True)]).T
+    return np.array([discrete(x) if of.op == "search" else x for of, x in zip(asked, answers, strict=True)]).T
 
 
-def two_digits(values):
-    """Numbers that a search finds, without what follows the pose smoothly: from which a place is found anew."""
-    size = 10.0 ** np.floor(np.log10(np.maximum(abs(values), 1e-6)) - 1.0)
-    return np.where(values == np.round(values), values, np.round(values / size) * size)
+def discrete(values):
+    """Numbers that a search finds: of a place in a cell, which follows the pose smoothly, whether it is at an end."""
+    return np.where(values == np.round(values), values, 0.5 * np.sign(values))
 
 
 def cells_of(known):
