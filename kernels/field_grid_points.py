@@ -65,22 +65,31 @@ TEXT = r"""
 
     // Asked are the first height, the centre from there, the cell, points along x and y, how many cells to each side
     // are tried, whether for a second one, and how far below the centre the field matters; found are the place in the
-    // nearest cell, and the second: whether it is there, the cell, the place in it, and whether that may move along x
-    // and y. Where no cell matters it is the one below the centre, and the place below that.
+    // nearest cell, and the second: 1 where it is there, and -1 of the first where the centre is not above the field;
+    // the cell, the place in it, and whether that may move along x and y. Where no cell matters it is the one below the
+    // centre, and the place below that.
     static CUDA_CALLABLE inline void sphere(const REAL* table, const REAL* asked, REAL* out)
     {
         const REAL *cells = table + 4ll * (int)asked[0], *size = asked + 4, bottom = asked[3] - asked[10];
         const int ring = (int)asked[8], tried = 4 * ring * ring;
-        REAL at[2], corners[4], away[CELLS][3], squares[CELLS], places[CELLS][4]; // a square below 0: inside
-        int middle[2], last[2], nearest = 0;
+        REAL at[2], corners[4], away[CELLS][3], places[CELLS][4];
+        REAL squares[CELLS]; // below 0: the centre is not above the cell's plane there
+        int middle[2], last[2], under[2], nearest = 0;
         for (int f = 0; f < 2; ++f) {
             last[f] = (int)asked[6 + f] - 2;
             const REAL x = asked[1 + f] * (1 / size[f]), most = asked[6 + f] - 1 + ring;
             at[f] = x > -ring ? (x < most ? x : most) : -ring;
             middle[f] = (int)(at[f] + ring + (REAL)0.5) - ring;
-            const int under = (int)(at[f] + ring) - ring, first = middle[f] - ring;
-            nearest = 2 * ring * nearest + (under - first < 2 * ring ? under - first : 2 * ring - 1);
+            const int first = middle[f] - ring, most_under = 2 * ring - 1;
+            under[f] = (int)(at[f] + ring) - ring - first;
+            under[f] = under[f] < most_under ? under[f] : most_under;
+            nearest = 2 * ring * nearest + under[f];
+            under[f] += first;
         }
+        levelled(cells, under, last, corners);
+        const REAL part = at[1] - under[1], low = corners[0] + part * (corners[1] - corners[0]);
+        const REAL high = corners[2] + part * (corners[3] - corners[2]);
+        const bool above = asked[3] > low + (at[0] - under[0]) * (high - low);
         REAL found = FAR;
         LOOP
         for (int n = 0; n < tried; ++n) {
@@ -99,12 +108,11 @@ TEXT = r"""
             if (foot.square < NEARER * found) nearest = n, found = foot.square;
         }
         for (int n = 0; n < 2 * PLACE; ++n) out[n] = 0;
-        const bool above = squares[nearest] > 0;
         const REAL* first = away[nearest];
         LOOP
         for (int round = 0; round < 2; ++round) { // the second looks away from what the first found
             REAL* row = out + PLACE * round;
-            row[0] = 1, row[1] = middle[0] - ring + nearest / (2 * ring);
+            row[0] = above ? 1 : -1, row[1] = middle[0] - ring + nearest / (2 * ring);
             row[2] = middle[1] - ring + nearest % (2 * ring);
             for (int f = 0; f < 4; ++f) row[3 + f] = places[nearest][f];
             if (round || !(int)asked[9] || !above || !(found < FAR)) return;

@@ -42,6 +42,26 @@ def test_a_ball_on_a_slope(friction):
     assert np.diff(energy).max() < 1e-8
 
 
+def test_a_sphere_above_a_tip_is_outside():
+    """Whatever the planes of its steep sides say, and whether gaps are asked for or not: no gap is below -radius."""
+    heights, radius, worlds = np.zeros((13, 13)), 0.03, 2000
+    heights[6, 6] = 0.15
+    ground = spo.HeightField(heights, 0.05, (-0.3, -0.3))
+    body = spo.Body(0.01, inertia=4e-6 * np.eye(3))
+    scene = spo.Scene(
+        [body], [spo.Hinge("free", -1, 0)], contacts=[spo.Contact(0, sphere=((0, 0, 0), radius))], ground=ground
+    )
+    rng = np.random.default_rng(0)
+    q, qd = np.tile(scene.neutral_q, (worlds, 1)), np.zeros((worlds, 6))
+    q[:, :2], q[:, 2] = rng.uniform(-0.1, 0.1, (worlds, 2)), rng.uniform(0.1, 0.3, worlds)
+    x, y = np.abs(q[:, 0]), np.abs(q[:, 1])
+    q = q[q[:, 2] > 0.15 * np.maximum(1.0 - x / 0.05, 0.0) * np.maximum(1.0 - y / 0.05, 0.0)]
+    dyn = spo.Dynamics(scene, len(q), "cpu", "float64")
+    report = dyn.step_report("contact_gap", like=q)
+    asked, free = dyn.step(q, qd[: len(q)], None, 2e-3, report=report), dyn.step(q, qd[: len(q)], None, 2e-3)
+    assert report.contact_gap.min() >= -radius and all(np.array_equal(*pair) for pair in zip(asked, free, strict=True))
+
+
 def rounded(name):
     """A body with a sphere of less than 0.7 cells and a capsule of more."""
     capsule = spo.Contact(0, capsule=((0, 0, -0.1), (0, 0, 0.1), 0.09), friction=0.3)

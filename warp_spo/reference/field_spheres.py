@@ -27,23 +27,24 @@ def nearest_points(field, centre, radius, number=0, both=True):
     start = centre - np.array(field.origin)
     ring = 1 if REACH * radius <= 0.5 * cell.min() else 2
     at = np.clip(start[:2] / cell, -ring, np.array(h.shape) - 1.0 + ring)
-    surfaces = []
+    surfaces, above = [], True
     for there, *found in np.reshape(find_cells(h, start, cell, ring, both), (2, PLACE)):
+        above = above and there >= 0.0
         if there:
             first, place, free = np.split(np.array(found), [2, 4])
             corners, inside = cell_corners(h, first.astype(int)), (at - first) * cell
             _, A, b = _least(corners, cell, inside, start[2], place)
             move = np.linalg.solve(np.where(np.outer(free, free) + np.eye(2) > 0.0, A, 0.0), b)
-            surfaces.append(_away(corners, cell, inside, start[2], place + free * move))
-    above = surfaces[0][1]
-    signed = [(up if above else -up, np.linalg.norm(up) if above else -np.linalg.norm(up)) for up, _ in surfaces]
+            surfaces.append(_away(corners, cell, inside, start[2], place + free * move)[0])
+    signed = [(up if above else -up, np.linalg.norm(up) if above else -np.linalg.norm(up)) for up in surfaces]
     return [(up / abs(distance), radius - distance) for up, distance in signed]
 
 
 def find_cells(heights, centre, cell, ring, both):
     """Return a place in the cell that is nearest to a centre, and a second one [2 PLACE].
 
-    Each is whether it is there; i, j of the cell; x and y from there [m]; whether it may move along x and y.
+    Each is 1 where it is there, and -1 for the first where the centre is not above the field; i, j of the cell; x and y
+    from there [m]; whether it may move along x and y.
 
     Args:
         heights: of one field [i, j]. centre: from its first point [m]. ring: how many cells to each side are tried.
@@ -60,7 +61,8 @@ def find_cells(heights, centre, cell, ring, both):
             found.append((first, cell_corners(heights, first), (at - first) * cell))
     feet = [_foot(*each[1:], centre[2], cell) for each in found]
     best = _first_nearest([foot[0] @ foot[0] for foot in feet])
-    away, above, *_ = feet[best]
+    away, under = feet[best][0], np.clip(np.floor(at), *np.array([found[0][0], found[-1][0]])).astype(int)
+    above = centre[2] > over_cell(cell_corners(heights, under), cell, *(at - under))[1]
     far = [
         other @ other if up and other @ away < APART * np.linalg.norm(other) * np.linalg.norm(away) else np.inf
         for other, up, *_ in feet
@@ -68,7 +70,7 @@ def find_cells(heights, centre, cell, ring, both):
     second = _first_nearest(far)
     numbers = lambda n: [*found[n][0], *feet[n][2], *feet[n][3]]  # noqa: E731
     there = both and above and np.isfinite(far[second])
-    return [1.0, *numbers(best), *([1.0, *numbers(second)] if there else [0.0] * PLACE)]
+    return [1.0 if above else -1.0, *numbers(best), *([1.0, *numbers(second)] if there else [0.0] * PLACE)]
 
 
 def _first_nearest(squares):

@@ -20,8 +20,8 @@ from ...trace.spatial import Vector, dot
 from .ground import GROUND, Corners, Edges, GroundOffset, Surface, clamp
 
 SPHERE, PLACE = "sphere", 7
-"""The search, and how many numbers each of two places has: whether it is there, i, j of its cell, x and y from there
-[m], and whether it may move along x and y."""
+"""The search, and how many numbers each of two places has: 1 where it is there, and -1 of the first where the centre is
+not above the field; i, j of its cell, x and y from there [m], and whether it may move along x and y."""
 REACH = 0.71  # sine of the steepest slope, 45 degrees, whose nearest point is among the cells for sure
 TINY = 1e-20  # square of a distance [m^2] that has no direction
 
@@ -42,12 +42,11 @@ class Foot(NamedTuple):
     """The nearest point of a cell.
 
     Attributes:
-        away: from there to the centre [m]. square: of that distance. outside: whether the centre is above the surface.
+        away: from there to the centre [m]. square: of that distance.
     """
 
     away: Vector
     square: Value
-    outside: Value
 
 
 def ring(ground: HeightField, radius: float) -> int:
@@ -80,15 +79,17 @@ def sphere_surfaces(
     at_x = clamp(x * (1.0 / size_x), rows - 1.0 + cells, -float(cells))
     at_y = clamp(y * (1.0 / size_y), columns - 1.0 + cells, -float(cells))
 
-    def surface(i: Value, j: Value, *where: Value, near: Value | None) -> Surface:
+    def surface(above: Value, i: Value, j: Value, *where: Value, near: Value | None) -> Surface:
         read = Corners.of(graph, ground, place, clamp(i, rows - 2.0), clamp(j, columns - 2.0))
         corners = read.levelled(Edges.of(i, j, rows - 1, columns - 1))
         cell = Cell(corners, (at_x - i) * size_x, (at_y - j) * size_y)
-        return _surface(read, _foot(cell, z, size_x, size_y, *where), radius, near)
+        return _surface(read, _foot(cell, z, size_x, size_y, *where), above, radius, near)
 
+    above = less(0.0, found[0])
     if not second:
-        return [surface(*found[1:PLACE], near=None)]
-    return [surface(*found[1:PLACE], near=1.0), surface(*found[PLACE + 1 :], near=less(0.5, found[PLACE]))]
+        return [surface(above, *found[1:PLACE], near=None)]
+    there = less(0.5, found[PLACE])
+    return [surface(above, *found[1:PLACE], near=1.0), surface(1.0, *found[PLACE + 1 :], near=there)]
 
 
 def _foot(
@@ -107,16 +108,15 @@ def _foot(
     square_x, square_y, both = a * a + 1.0, b * b + 1.0, (along_x * along_y) * (a * b - w * twist)
     inverse = reciprocal(square_x * square_y - both * both)
     s, t = s + (square_y * right_x - both * right_y) * inverse, t + (square_x * right_y - both * right_x) * inverse
-    a, b = run + twist * t, rise + twist * s
-    away = Vector((x - s, y - t, above - run * s - b * t))
-    return Foot(away, dot(away, away), less(0.0, away[2] - a * away[0] - b * away[1]))
+    away = Vector((x - s, y - t, above - run * s - (rise + twist * s) * t))
+    return Foot(away, dot(away, away))
 
 
-def _surface(read: Corners, foot: Foot, radius: Value, near: Value | None) -> Surface:
-    """Return the surface at the nearest point; a centre inside of the ground leaves it the shortest way."""
+def _surface(read: Corners, foot: Foot, above: Value, radius: Value, near: Value | None) -> Surface:
+    """Return the surface at the nearest point; a centre not ``above`` the ground leaves it the shortest way."""
     known = less(TINY, foot.square)
     inverse = inverse_root(select(known, foot.square, 1.0))
-    sign = select(foot.outside, 1.0, -1.0)
+    sign = select(above, 1.0, -1.0)
     outward = sign * inverse
     x, y, z = (outward * part for part in foot.away)
     normal = Vector((select(known, x, 0.0), select(known, y, 0.0), select(known, z, 1.0)))
