@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from ..dynamics.dynamics import Dynamics
+from ..dynamics.stepping.joint_space import check_pair_solver
 from ..dynamics.stepping.options import StepOptions, StepReport
 from ..errors import shown
 from ..execution.device_facts import read_facts
@@ -153,6 +154,7 @@ class Env(VecEnv):
         self._layout.keeps_failures = keep_failures is not None
         tracing = self._trace(arguments.check_parts(actions), *terms, commands, events)
         variable = self._layout.values
+        check_pair_solver("Env", pair_solver)
         options: dict[str, Any] = {"granularity": granularity, "pair_solver": pair_solver}
         self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable, **options)
         store = self._store = self._allocate(tracing)

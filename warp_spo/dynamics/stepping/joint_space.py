@@ -53,7 +53,7 @@ def is_generated(dyn: Dynamics) -> bool:
 
 def check_pair_solver(call: str, given: Any) -> None:
     """Raise ValueError unless it names a solver of pairs of bodies, or None."""
-    if given not in (None, *PAIR_SOLVERS):
+    if given is not None and not (isinstance(given, str) and given in PAIR_SOLVERS):
         raise ValueError(f"{call}: pair_solver is {given!r}; expected None or {PAIR_SOLVERS[0]!r}")
 
 
