@@ -37,7 +37,7 @@ from typing import Any
 
 import warp as wp
 
-RESULTS = Path(__file__).parent / "results" / "files" / "2026-11-28-cpu-newton-tests.json"
+RESULTS = Path(__file__).parent / "results" / "files" / "2026-11-29-cpu-newton-tests.json"
 SOLVERS = ("SolverFeatherstone", "SolverMuJoCo", "SolverSemiImplicit", "SolverXPBD")
 SUFFIX = re.compile(r"_(featherstone|mujoco(_cpu|_warp|_c)?|semi_implicit|xpbd)(?=_|$)")
 OTHERS = re.compile(r"_(steel|kamino|lox|vbd|admm|mpm|steel_colored)(_|$)")
