@@ -394,7 +394,7 @@ def Xform "b" (prepend apiSchemas = ["PhysicsRigidBodyAPI"]) {
 
 
 def test_small_bodies_are_repaired_in_proportion():
-    """What no body can have is replaced at every size, by the same share of the largest moment."""
+    """Impossible inertias are replaced at every size, by the same share of the largest moment."""
     for moments in ([-1.0, 2.0, 2.0], [1.0, 1.0, 4.0], [0.0, 1.0, 1.0]):
         for scale in (1e-4, 1e-8, 1e-12):
             _, inertia = repaired(scale, scale * np.diag(moments))

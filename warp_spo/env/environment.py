@@ -90,8 +90,9 @@ class Env(VecEnv):
         q, qd: state, torch tensors [world, coordinate] and [world, dof].
         final: the argument ``final_observations``. bounds: those that end worlds.
         replay: runs a step without its inputs and results; ``replay.captured`` says of how many graphs it is made.
-        values: what events have made of the scene's values, torch tensors [world, ...] by name. What torch writes there
-            counts for terms and for the dynamics from the next step on, until an event draws the value anew.
+        values: what events have made of the scene's values, torch tensors [world, ...] by name. Numbers that
+            torch writes there count for terms and for the dynamics from the next step on, until an event draws the
+            value anew.
         dyn: the :class:`Dynamics`. has_commands: whether it gives commands.
         action_labels, action_clips: of each action, what it sets, and None or the (lowest, highest) that counts.
         options: with which a task has changed its arguments, see ``settings.make_env``; {} without a task.

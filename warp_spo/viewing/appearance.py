@@ -130,7 +130,8 @@ def _imported(file: Path, scene: Scene) -> Appearance:
 def urdf_with_files(file: Path) -> tuple[str, list[str]]:
     """Return the text of a URDF whose meshes are paths of files, in metres, and names of meshes without a file.
 
-    Files are found as :func:`warp_spo.load` finds them, which asks no network. What they are missing for is left out.
+    Files are found as :func:`warp_spo.load` finds them, which asks no network. Shapes whose
+    files are missing are left out.
     """
     from ..newton.files.urdf_masses import mesh_file, unit_of
     from ..newton.files.xml_source import read_xml
