@@ -158,6 +158,7 @@ class Env(VecEnv):
         check_pair_solver("Env", pair_solver)
         options: dict[str, Any] = {"granularity": granularity, "pair_solver": pair_solver}
         self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable, **options)
+        self.dyn._checks_results = False  # the guard looks at them
         store = self._store = self._allocate(tracing)
         self.q, self.qd, self.actions, self.chosen = (store.tensors[n] for n in ("q", "qd", "actions", "chosen"))
         self._tensors, self._controls, self._report = store.tensors, store.controls, StepReport(**store.written)
