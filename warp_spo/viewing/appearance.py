@@ -133,10 +133,13 @@ def urdf_with_files(file: Path) -> tuple[str, list[str]]:
     Files are found as :func:`warp_spo.load` finds them, which asks no network. Shapes whose
     files are missing are left out.
     """
+    from ..newton.files.urdf import origin_of
     from ..newton.files.urdf_masses import mesh_file, unit_of
+    from ..newton.files.urdf_up_axis import turn_meshes
     from ..newton.files.xml_source import read_xml
 
     robot, missing = read_xml(file), dict[str, None]()
+    turn_meshes(robot, origin_of)
     for link in robot.findall("link"):
         for shape in [*link.findall("visual"), *link.findall("collision")]:
             found: Any

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import UnsupportedError, quoted
-from ...scene.collision_shapes import NONE, ShapeSelection
+from ...scene.collision_shapes import NONE, CollisionShape, ShapeSelection
 from ...scene.parts import UNLIMITED, Body, Hinge
 from ...scene.scene import Scene
 from ..worlds import quote_labels
@@ -26,6 +26,7 @@ from .urdf_masses import mass_of_shapes
 from .urdf_mimics import SCALAR, read_mimics
 from .urdf_shapes import urdf_pairs, urdf_shapes
 from .urdf_unknown import warn_of_unknown
+from .urdf_up_axis import turn_meshes
 from .xml_source import XmlElement, read_xml
 
 KINDS = {
@@ -93,8 +94,16 @@ def read_urdf(file: Path, floating: bool | None, repair: bool, selection: ShapeS
         raise ValueError(f"load: {str(file)!r}: {error}") from error
     ordered = [links[link] for link in number]
     call = f"load: {str(file)!r}"
-    shapes = functools.cache(lambda: urdf_shapes(robot, ordered, list(map(label, number)), _origin))
+    turned = list[str]()
+
+    @functools.cache
+    def shapes() -> list[CollisionShape]:
+        turned.append(turn_meshes(robot, origin_of))
+        return urdf_shapes(robot, ordered, list(map(label, number)), origin_of)
+
     scene, lost = selection.apply(call, scene, shapes, pairs=lambda: urdf_pairs(call, scene, shapes()))
+    if any(turned):
+        warnings.warn(f"{call}: {turned[0]}", UserWarning, stacklevel=3)
     if lost:
         warnings.warn(f"{call}: left out: {', '.join(lost)}", UserWarning, stacklevel=3)
     return scene
@@ -189,7 +198,7 @@ def _hinge(joint: XmlElement, number: dict[str, int], label: Callable[[str], str
         values["axis"] = _in_plane(axis) if kind == "planar" else axis
     if kind in SCALAR:
         values |= _limits(joint, kind)
-    position, turn = _origin(joint)
+    position, turn = origin_of(joint)
     if held is not None:
         position, turn = _moved(position, turn, kind, _axis(joint), held)
         kind, values = "fixed", {}
@@ -202,7 +211,7 @@ def _hinge(joint: XmlElement, number: dict[str, int], label: Callable[[str], str
         raise joint.error(str(error)) from error
 
 
-def _origin(holder: XmlElement) -> tuple[np.ndarray, np.ndarray]:
+def origin_of(holder: XmlElement) -> tuple[np.ndarray, np.ndarray]:
     """Return the position [m, 3] and the unit quaternion (xyzw) that an element's <origin> gives."""
     origin = holder.child("origin")
     if origin is None:
@@ -369,6 +378,6 @@ def _inertial(link: XmlElement) -> Inertial:
     mass, tensor = (part for part in parts if part is not None)
     xx, xy, xz, yy, yz, zz = (tensor.number(f"i{name}") for name in ("xx", "xy", "xz", "yy", "yz", "zz"))
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    com, turn = _origin(inertial)
+    com, turn = origin_of(inertial)
     rotation = _rotation(turn)
     return mass.number("value"), com, inertia if turn[3] == 1.0 else rotation @ inertia @ rotation.T
