@@ -11,9 +11,12 @@ LANES = WARP_SIZE  # that share a world on a GPU; one does all elsewhere
 LOOPS = 6  # as warp_spo.Status, which kernels cannot import; a test compares
 ANGLE, ROTATION = 1, 2  # kinds of coordinates: an angle, and the first of four that are a quaternion
 FARTHEST = 1e10  # [rad]; beyond, full turns are subtracted with an error above 1e-6 rad
+FAR = 1e6
+"""Poses and velocities of bodies are finite where the numbers of a finite state are below this [m, rad, m/s, rad/s]: lengths
+that would make them infinite have inertias that are not finite, so the state is not."""
 SQUARES = {wp.float32: (1e-30, 1e38), wp.float64: (1e-290, 1e307)}
 """Between these lies the sum of squares of a quaternion that is normalised as it should be."""
-BAD, BAD_RANGE, BAD_QUATERNION = 1, 2, 4  # bits of what a lane finds
+BAD, BAD_RANGE, BAD_QUATERNION, BEYOND_FAR = 1, 2, 4, 8  # bits of what a lane finds
 
 
 @wp.func_native("""
@@ -31,7 +34,7 @@ def check_results(T: type) -> wp.Kernel:
 
     NOT_FINITE and QUATERNION stay; so do other words as severe where results alone are the matter. Arrays are those
     that a call has written, [world, ...], or None. A gap may be infinite. ``kinds`` [coordinate] is ANGLE, ROTATION
-    or 0.
+    or 0. Poses and velocities are read only where the state is beyond FAR: they are most of what a step writes.
     """
     tiny, least, most = T(NORMAL[T][0]), *(T(x) for x in SQUARES[T])
 
@@ -41,6 +44,7 @@ def check_results(T: type) -> wp.Kernel:
         if array:
             for i in range(lane, array.shape[1], lanes):
                 bad |= wp.where(wp.isfinite(array[world, i]), 0, wp.static(BAD))
+                bad |= wp.where(wp.abs(array[world, i]) < T(wp.static(FAR)), 0, wp.static(BEYOND_FAR))
         return bad
 
     @wp.func
@@ -91,13 +95,15 @@ def check_results(T: type) -> wp.Kernel:
         bad |= bad_of_row(q_after, world, lane, lanes) | bad_of_row(rates, world, lane, lanes)
         bad |= bad_of_row(qdd, world, lane, lanes) | bad_of_row(slip, world, lane, lanes)
         bad |= bad_of_row(excess, world, lane, lanes) | bad_of_rows(force, world, lane, lanes)
-        bad |= bad_of_rows(poses, world, lane, lanes) | bad_of_rows(velocities, world, lane, lanes)
         if residual:
             bad |= wp.where(wp.isfinite(residual[world]), 0, wp.static(BAD))
         if gap:
             for i in range(lane, gap.shape[1], lanes):
                 bad |= wp.where(wp.isnan(gap[world, i]), wp.static(BAD), 0)
         bad = any_lane(bad, lanes)
+        if bad & wp.static(BEYOND_FAR):
+            bad |= bad_of_rows(poses, world, lane, lanes) | bad_of_rows(velocities, world, lane, lanes)
+            bad = any_lane(bad, lanes) & ~wp.static(BEYOND_FAR)
         if lane == 0 and bad != 0:
             known = status_out[world]
             if bad & wp.static(BAD_QUATERNION):
