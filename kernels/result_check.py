@@ -12,8 +12,10 @@ LOOPS = 6  # as warp_spo.Status, which kernels cannot import; a test compares
 ANGLE, ROTATION = 1, 2  # kinds of coordinates: an angle, and the first of four that are a quaternion
 FARTHEST = 1e10  # [rad]; beyond, full turns are subtracted with an error above 1e-6 rad
 FAR = 1e6
-"""Poses and velocities of bodies are finite where the numbers of a finite state are below this [m, rad, m/s, rad/s]: lengths
-that would make them infinite have inertias that are not finite, so the state is not."""
+"""Poses and velocities of bodies are finite where the numbers of a finite state are below this [m, rad, m/s, rad/s].
+
+Lengths that would make them infinite have inertias that are not finite, so that the state is not finite either.
+"""
 SQUARES = {wp.float32: (1e-30, 1e38), wp.float64: (1e-290, 1e307)}
 """Between these lies the sum of squares of a quaternion that is normalised as it should be."""
 BAD, BAD_RANGE, BAD_QUATERNION, BEYOND_FAR = 1, 2, 4, 8  # bits of what a lane finds
