@@ -41,12 +41,17 @@ def check_results(T: type) -> wp.Kernel:
     tiny, least, most = T(NORMAL[T][0]), *(T(x) for x in SQUARES[T])
 
     @wp.func
+    def bad_of(x: T):
+        return wp.where(wp.isfinite(x), 0, wp.static(BAD)) | wp.where(
+            wp.abs(x) < T(wp.static(FAR)), 0, wp.static(BEYOND_FAR)
+        )
+
+    @wp.func
     def bad_of_row(array: wp.array2d[T], world: int, lane: int, lanes: int):
         bad = int(0)
         if array:
             for i in range(lane, array.shape[1], lanes):
-                bad |= wp.where(wp.isfinite(array[world, i]), 0, wp.static(BAD))
-                bad |= wp.where(wp.abs(array[world, i]) < T(wp.static(FAR)), 0, wp.static(BEYOND_FAR))
+                bad |= bad_of(array[world, i])
         return bad
 
     @wp.func
@@ -59,12 +64,25 @@ def check_results(T: type) -> wp.Kernel:
         return bad
 
     @wp.func
-    def bad_of_state(q: wp.array2d[T], kinds: wp.array[wp.int32], world: int, lane: int, lanes: int):
+    def bad_of_state(
+        q: wp.array2d[T],
+        kinds: wp.array[wp.int32],
+        q_after: wp.array2d[T],
+        rates: wp.array2d[T],
+        world: int,
+        lane: int,
+        lanes: int,
+    ):
         bad = int(0)
-        for i in range(lane, kinds.shape[0], lanes):
-            if kinds[i] == wp.static(ANGLE) and wp.abs(q[world, i]) > T(wp.static(FARTHEST)):
+        for i in range(lane, kinds.shape[0], lanes):  # one loop, so that its four loads wait together
+            kind, x = kinds[i], q[world, i]
+            if q_after:
+                bad |= bad_of(q_after[world, i])
+            if i < rates.shape[1]:  # there are never more dofs than coordinates
+                bad |= bad_of(rates[world, i])
+            if kind == wp.static(ANGLE) and wp.abs(x) > T(wp.static(FARTHEST)):
                 bad |= wp.static(BAD_RANGE)
-            if kinds[i] == wp.static(ROTATION):
+            if kind == wp.static(ROTATION):
                 square = T(0.0)
                 for c in range(4):
                     square += q[world, i + c] * q[world, i + c]
@@ -93,8 +111,7 @@ def check_results(T: type) -> wp.Kernel:
         status_out: wp.array[wp.int32],
     ):
         world, lane = wp.tid() // lanes, wp.tid() % lanes
-        bad = bad_of_state(q, kinds, world, lane, lanes)
-        bad |= bad_of_row(q_after, world, lane, lanes) | bad_of_row(rates, world, lane, lanes)
+        bad = bad_of_state(q, kinds, q_after, rates, world, lane, lanes)
         bad |= bad_of_row(qdd, world, lane, lanes) | bad_of_row(slip, world, lane, lanes)
         bad |= bad_of_row(excess, world, lane, lanes) | bad_of_rows(force, world, lane, lanes)
         if residual:
