@@ -33,7 +33,7 @@ from .evidence import ROOT
 OPERATIONS = ("forward_dynamics", "inverse_dynamics", "mass_matrix", "step")
 SCENES = ("panda", "go2", "g1")
 CLAIMED = (("panda", "solver_step"), ("g1", "operational_inertia_inverse"))
-"""What the README's headline says besides: SolverSPO.step of a Newton model, and the inertia at two feet."""
+"""Further rows of the README's headline: SolverSPO.step of a Newton model, and the inertia at two feet."""
 WORLDS, CPU_WORLDS = (4096, 65536), (64, 1024)
 ROUNDS = 5  # processes of each commit that count
 LIMIT = 1800.0  # [s] for one process, which may have to compile all kernels
