@@ -262,7 +262,7 @@ def test_bounds_are_explained(guarded):
 
 
 def test_a_training_prints_what_ended_worlds(tmp_path, capsys):
-    """What is new since the last line; rows hold sums of kinds, and of names those that have been counted."""
+    """Ends that are new since the last line; rows hold sums of kinds, and of names those that have been counted."""
     names = ("/not finite/reward", "/not finite/reward/up", "/not finite/reward/far", "/beyond bounds/action")
     counts = [torch.zeros(4), torch.tensor([3.0, 3.0, 0.0, 1.0]), torch.tensor([5.0, 3.0, 2.0, 1.0])]
     always = dict.fromkeys(("/episode/finished", "/episode/whole", "/episode/seconds"), torch.tensor(1.0))

@@ -12,7 +12,7 @@ import pytest
 import warp_spo as spo
 from benchmarks.robot_files import compare_urdf, short, urdf_files
 from warp_spo.newton import load
-from warp_spo.newton.files.inertia_repair import repaired
+from warp_spo.newton.files.inertia_repair import repair_body
 from warp_spo.reference.dense import Dense, homogeneous
 from warp_spo.viewing.appearance import file_appearance
 
@@ -356,7 +356,7 @@ def test_inertias_are_replaced_by_newtons_rule(rng):
         body = builder.add_body()
         builder.body_mass[body], builder.body_inertia[body] = float(mass), inertia
     model = builder.finalize(device="cpu")
-    ours = [repaired(float(mass), inertia) for mass, inertia in zip(masses, inertias, strict=True)]
+    ours = [repair_body(float(mass), inertia) for mass, inertia in zip(masses, inertias, strict=True)]
     np.testing.assert_array_equal(model.body_mass.numpy(), [mass for mass, _ in ours])
     assert sum(not np.array_equal(new, old) for (_, new), old in zip(ours, inertias, strict=True)) > 100
     for (_, mine), theirs, given in zip(ours, model.body_inertia.numpy(), moments, strict=True):
@@ -398,8 +398,8 @@ def test_small_bodies_are_repaired_in_proportion():
     """Impossible inertias are replaced at every size, by the same share of the largest moment."""
     for moments in ([-1.0, 2.0, 2.0], [1.0, 1.0, 4.0], [0.0, 1.0, 1.0]):
         for scale in (1e-4, 1e-8, 1e-12):
-            _, inertia = repaired(scale, scale * np.diag(moments))
-            _, same = repaired(1.0, 1e-4 * np.diag(moments))
+            _, inertia = repair_body(scale, scale * np.diag(moments))
+            _, same = repair_body(1.0, 1e-4 * np.diag(moments))
             np.testing.assert_allclose(inertia / scale, same / 1e-4, rtol=1e-9)
             low, middle, high = np.linalg.eigvalsh(inertia)
             assert low > 0.0 and low + middle >= high

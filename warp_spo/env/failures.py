@@ -1,4 +1,4 @@
-"""What is kept of worlds that fail: a ring of their last states on the device, and a thread that writes files.
+"""Records of worlds that fail: a ring of their last states on the device, and a thread that writes files.
 
 A world fails where the guard ends it, or where a step of the dynamics gives it a status from CONTACT on by severity.
 The device copies the ring of such a world aside within the step; the host learns of it by a number that the device

@@ -111,7 +111,7 @@ def _frictions(source: Source, geom: int, ground: int | None, pairs: Pairs) -> d
                 source.left_out.append(f"{words}, which has {value:g} in all directions")
         values = slide, torsional, roll
     else:
-        both = _counting(m, geom, ground)
+        both = _take_by_priority(m, geom, ground)
         values, dimensions = m.geom_friction[both].max(axis=0), m.geom_condim[both].max()
     if source.enabled("OVERRIDE"):
         values = m.opt.o_friction[[0, 2, 3]]
@@ -119,7 +119,7 @@ def _frictions(source: Source, geom: int, ground: int | None, pairs: Pairs) -> d
     return {name: float(value) if dimensions >= least else 0.0 for name, value, least in leasts}
 
 
-def _counting(m: Any, geom: int, ground: int | None) -> list[int]:
+def _take_by_priority(m: Any, geom: int, ground: int | None) -> list[int]:
     """Return the geoms of a contact that give it its values: those of the highest priority."""
     both = [geom] if ground is None else [geom, ground]
     priority = max(m.geom_priority[g] for g in both)
@@ -135,7 +135,7 @@ def _unread_softness(source: Source, geom: int, ground: int | None, pairs: Pairs
     elif pair is not None:
         rows = {name: [getattr(m, f"pair_{name}")[pair]] for name in SOFTNESS}
     else:
-        rows = {name: getattr(m, f"geom_{name}")[_counting(m, geom, ground)] for name in ("solref", "solimp")}
+        rows = {name: getattr(m, f"geom_{name}")[_take_by_priority(m, geom, ground)] for name in ("solref", "solimp")}
     return ", ".join(name for name, values in rows.items() if (np.array(values) != SOFTNESS[name]).any())
 
 

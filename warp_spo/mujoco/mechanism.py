@@ -130,12 +130,14 @@ class Mechanism:
         values = self._dof_values(joint) | {"label": label, "rest": scene_entries(kind, m.qpos_spring, adr)}
         if kind == FREE:
             return Hinge("free", parent, child, **values)
-        at = composed(pose, (*anchor, *UPRIGHT))
+        at = compose_poses(pose, (*anchor, *UPRIGHT))
         back = (*anchor, *UPRIGHT)
         if kind == BALL:
             return Hinge("ball", parent, child, parent_pose=at, child_pose=back, **values)
         ref = -float(m.qpos0[adr])  # the anchor is where the child stands at zero
-        at = composed(at, (*(axis * ref), *UPRIGHT) if kind == SLIDE else (0.0, 0.0, 0.0, *turned_about(axis, ref)))
+        at = compose_poses(
+            at, (*(axis * ref), *UPRIGHT) if kind == SLIDE else (0.0, 0.0, 0.0, *turned_about(axis, ref))
+        )
         return Hinge(KINDS[kind], parent, child, axis=axis, parent_pose=at, child_pose=back, **values)
 
     @functools.cached_property
@@ -234,7 +236,7 @@ def turned_about(axis: np.ndarray, angle: float) -> np.ndarray:
     return xyzw(quaternion)
 
 
-def composed(outer: Any, inner: Any) -> np.ndarray:
+def compose_poses(outer: Any, inner: Any) -> np.ndarray:
     """Return the pose ``inner``, given in the pose ``outer``; both are x, y, z and a quaternion x, y, z, w."""
     place, turn = np.empty(3), np.empty(4)
     quaternion = wxyz(outer[3:])

@@ -164,15 +164,15 @@ def _softness(source: Source) -> Iterator[str]:
     if m.neq and not source.disabled("EQUALITY"):
         used = np.flatnonzero(m.eq_active0.astype(bool) & (soft("eq", "solref") | soft("eq", "solimp")))
         if used.size:
-            yield f"the softness (solref, solimp) of {_listed(source, 'equality', used)} (they hold exactly)"
+            yield f"the softness (solref, solimp) of {_list_some(source, 'equality', used)} (they hold exactly)"
     if m.nv and not source.disabled("FRICTIONLOSS"):
         dofs = (m.dof_frictionloss > 0.0) & (soft("dof", "solref") | soft("dof", "solimp"))
         if dofs.any():
-            names = _listed(source, "joint", np.unique(m.dof_jntid[dofs]))
+            names = _list_some(source, "joint", np.unique(m.dof_jntid[dofs]))
             yield f"the softness (solreffriction, solimpfriction) of the friction of {names}"
 
 
-def _listed(source: Source, kind: str, indices: np.ndarray) -> str:
+def _list_some(source: Source, kind: str, indices: np.ndarray) -> str:
     """Return the first eight of some elements in words, and the number of the others."""
     more = f" and {len(indices) - 8} more" if len(indices) > 8 else ""
     return ", ".join(source.words(kind, int(index)) for index in indices[:8]) + more

@@ -120,7 +120,7 @@ def _without_gradient(dyn: Dynamics, arguments: dict[str, Any]) -> str:
     return ""
 
 
-def _lacking(links: Links) -> str:
+def _find_what_lacks_gradients(links: Links) -> str:
     """Return what of a scene has no gradient, and the way out; "" if nothing."""
     way = "leave out contacts with other=, as those with the ground have gradients, or call inside torch.no_grad()"
     why = reason_against_gradients(links.scene, tuple(links.variable)) if links.scene.contact_pairs else ""
@@ -180,7 +180,7 @@ STEP = Operation(
         refuses=_without_gradient,
         adds=_solve_in_joint_space,
         repeats=_take_substeps,
-        lacking=_lacking,
+        lacking=_find_what_lacks_gradients,
     ),
 )
 

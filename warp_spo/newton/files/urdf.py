@@ -200,7 +200,7 @@ def _hinge(joint: XmlElement, number: dict[str, int], label: Callable[[str], str
         values |= _limits(joint, kind)
     position, turn = origin_of(joint)
     if held is not None:
-        position, turn = _moved(position, turn, kind, _axis(joint), held)
+        position, turn = _move_child(position, turn, kind, _axis(joint), held)
         kind, values = "fixed", {}
     pose = np.concatenate([position, turn])
     try:
@@ -225,7 +225,7 @@ def origin_of(holder: XmlElement) -> tuple[np.ndarray, np.ndarray]:
     return origin.numbers("xyz", 3, (0.0, 0.0, 0.0)), np.array(quaternion)
 
 
-def _moved(
+def _move_child(
     position: np.ndarray, turn: np.ndarray, kind: str, axis: np.ndarray, q: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the position and the unit quaternion of a joint's child where the joint's coordinate is ``q``."""

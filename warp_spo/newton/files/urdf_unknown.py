@@ -39,7 +39,7 @@ def warn_of_unknown(file: Path, holders: Iterable[XmlElement]) -> None:
         for words in dict.fromkeys(_unknown(holder)):
             found.setdefault(f"{words} of {holder.tag}s", []).append(str(holder.get("name")))
     if found:
-        parts = [f"{words} {_listed(names)}" for words, names in list(found.items())[:MOST]]
+        parts = [f"{words} {_list_some(names)}" for words, names in list(found.items())[:MOST]]
         more = f", and {len(found) - MOST} more" if len(found) > MOST else ""
         warnings.warn(
             f"load: {str(file)!r}: left out, because URDF does not define it: {', '.join(parts)}{more}; correct the "
@@ -49,7 +49,7 @@ def warn_of_unknown(file: Path, holders: Iterable[XmlElement]) -> None:
         )
 
 
-def _listed(names: list[str]) -> str:
+def _list_some(names: list[str]) -> str:
     more = f" and {len(names) - NAMES} more" if len(names) > NAMES else ""
     return ", ".join(quoted(name) for name in names[:NAMES]) + more
 

@@ -85,7 +85,7 @@ def _read(
     """Return the scene of a file, and in words what it leaves out; arguments and errors as :func:`read_usd`."""
     from pxr import UsdGeom, UsdPhysics  # an ImportError names the extra
 
-    stage = _opened(file)
+    stage = _open_stage(file)
     metre, kilogram = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
     for name, unit in (("metersPerUnit", metre), ("kilogramsPerUnit", kilogram)):
         if not UNITS[0] <= unit <= UNITS[1]:
@@ -93,7 +93,7 @@ def _read(
     check_values(call, stage)
     placed = joints_placed_on_world(stage)
     prepare(call, stage)
-    builder, found = _imported(stage, floating, metre**3 / kilogram)
+    builder, found = _import_stage(stage, floating, metre**3 / kilogram)
     if builder.body_count == 0:
         raise ValueError(f"{call} has no rigid bodies; expected prims with PhysicsRigidBodyAPI")
     joints = ImportedJoints(call, stage, builder, found["path_joint_map"])
@@ -113,7 +113,7 @@ def _read(
     return scene, left_out(stage, of_loops, set(found["path_joint_map"]), found["physics_scene_path"], contacts)
 
 
-def _opened(file: Path) -> Any:
+def _open_stage(file: Path) -> Any:
     """Return the stage of a file.
 
     Raises:
@@ -135,7 +135,7 @@ def _opened(file: Path) -> Any:
     return stage
 
 
-def _imported(stage: Any, floating: bool | None, density: float) -> tuple[newton.ModelBuilder, dict[str, Any]]:
+def _import_stage(stage: Any, floating: bool | None, density: float) -> tuple[newton.ModelBuilder, dict[str, Any]]:
     """Return what Newton's importer makes of a stage, and what it says of it.
 
     Args:

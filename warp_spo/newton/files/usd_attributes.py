@@ -49,7 +49,7 @@ def _axis(name: str, limited: bool) -> dict[str, Names]:
     return read | ({f"PhysicsLimitAPI:{name}": (f"limit:{name}:physics:*",)} if limited else {})
 
 
-def _joined(*parts: Mapping[str, Names]) -> dict[str, Names]:
+def _join_tables(*parts: Mapping[str, Names]) -> dict[str, Names]:
     """Return all names of several tables, by the schema that they need."""
     return {api: sum((part.get(api, ()) for part in parts), ()) for part in parts for api in part}
 
@@ -63,13 +63,13 @@ READ: dict[str, dict[str, Names]] = {
     },
     "shape": MASS | {"": ("physics:collisionEnabled", "newton:massModel", "newton:shellThickness", "mjc:shellinertia")},
     "material": {"": ("physics:density",)},
-    "PhysicsFixedJoint": _joined(JOINT, {"": ("physxJoint:*", "physics:axis", "physics:*Limit")}),
-    "PhysicsRevoluteJoint": _joined(JOINT, GEARS, {"": DOFS + LIMITS + SINGLE}, _axis("angular", False)),
-    "PhysicsPrismaticJoint": _joined(JOINT, GEARS, {"": DOFS + LIMITS + SINGLE}, _axis("linear", False)),
-    "PhysicsSphericalJoint": _joined(JOINT, {"": ("physics:axis", *DOFS)}),
-    "PhysicsJoint": _joined(JOINT, {"": DOFS + LIMITS}, *(_axis(name, True) for name in AXES)),
-    "PhysicsDistanceJoint": _joined(JOINT, {"": ("physics:minDistance", "physics:maxDistance")}),
-    "loop": _joined(JOINT, {"": ("physics:axis", "mjc:torqueScale")}),
+    "PhysicsFixedJoint": _join_tables(JOINT, {"": ("physxJoint:*", "physics:axis", "physics:*Limit")}),
+    "PhysicsRevoluteJoint": _join_tables(JOINT, GEARS, {"": DOFS + LIMITS + SINGLE}, _axis("angular", False)),
+    "PhysicsPrismaticJoint": _join_tables(JOINT, GEARS, {"": DOFS + LIMITS + SINGLE}, _axis("linear", False)),
+    "PhysicsSphericalJoint": _join_tables(JOINT, {"": ("physics:axis", *DOFS)}),
+    "PhysicsJoint": _join_tables(JOINT, {"": DOFS + LIMITS}, *(_axis(name, True) for name in AXES)),
+    "PhysicsDistanceJoint": _join_tables(JOINT, {"": ("physics:minDistance", "physics:maxDistance")}),
+    "loop": _join_tables(JOINT, {"": ("physics:axis", "mjc:torqueScale")}),
 }  # fmt: skip
 """Attributes that a scene takes up, as patterns: by the part of a prim and the applied schema that they need."""
 
@@ -133,7 +133,7 @@ PLACE: Names = ("xformOp*",)
 SHAPE: Names = ("size", "radius*", "height", "axis", "width", "length", "points", "faceVertex*", "orientation")
 """Attributes of geometry, of a prim with a body or a shape at or below it, and of a shape itself."""
 UNBOUNDED = 1e30
-"""What is above is without bound: files write the largest number of float32 for it."""
+"""Numbers above it are without bound: files write the largest number of float32 for it."""
 MOST = 100
 """Names of attributes in one warning."""
 

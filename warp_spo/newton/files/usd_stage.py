@@ -282,7 +282,7 @@ def reversed_joints(stage: Any, joints: list[Any]) -> list[Any]:
     for start in neighbors:
         if start in seen:
             continue
-        above = _reached(start, neighbors)
+        above = _find_reached(start, neighbors)
         seen |= set(above)
         if any(len({ends[joint] for joint in some}) > 1 for body in above for some in neighbors[body].values()):
             continue  # two joints between the same bodies are one if they lead the same way, a loop otherwise
@@ -296,7 +296,7 @@ def reversed_joints(stage: Any, joints: list[Any]) -> list[Any]:
                     down = sum(1 if ends[joint][0] == parent else -1 for joint in neighbors[body][parent])
                     upward[body] = upward[parent] + down
             roots = {min(upward, key=lambda body: (upward[body], not _is_root(stage, body)))}
-        above = _reached(roots.pop(), neighbors)
+        above = _find_reached(roots.pop(), neighbors)
         turned += [j for body, parent in above.items() if parent for j in neighbors[body][parent] if ends[j][0] == body]
     return turned
 
@@ -312,7 +312,7 @@ def is_equality(prim: Any) -> bool:
     return not {"MjcEqualityConnectAPI", "MjcEqualityWeldAPI"}.isdisjoint(applied_schemas(prim))
 
 
-def _reached(start: str, neighbors: dict[str, dict[str, list[Any]]]) -> dict[str, str | None]:
+def _find_reached(start: str, neighbors: dict[str, dict[str, list[Any]]]) -> dict[str, str | None]:
     """Return the bodies that joints reach from one, nearest first, each with the body before it."""
     found: dict[str, str | None] = {start: None}
     queue = deque([start])
