@@ -4,8 +4,8 @@
                                  [--variants stock graphs ...] [--kernels] [--train tf32 bfloat16]
 
 ``collect`` and ``learn`` are medians over iterations in ms of wall time, ``iteration`` the whole with the log's rows,
-``busy`` the time in which a kernel of the GPU was at work, ``kernels`` their number. --kernels lists those that take
-longest. A variant that fails has the error in place of times. --train: seconds from the command, with an empty kernel
+``busy`` the time in which a kernel of the GPU was at work, ``kernels`` their number. --kernels lists those of rollouts and of
+updates that take longest. A variant that fails has the error in place of times. --train: seconds from the command, with an empty kernel
 cache, to the first checkpoint that walks as ASKED; kernels of the measure itself are compiled apart.
 """
 
@@ -58,6 +58,12 @@ class Unfused(CapturedPPO):
     fuses = False
 
 
+class OnTensorCores(CapturedPPO):
+    """Products, ELU and its slope are one kernel."""
+
+    on_tensor_cores = True
+
+
 class ActingCaptured(Unfused):
     """rsl_rl's update with acting as a graph."""
 
@@ -102,6 +108,8 @@ VARIANTS = {
     "fused": Variant(CapturedPPO),
     "fused, float32": Variant(CapturedPPO, precision="float32"),
     "fused, bfloat16": Variant(CapturedPPO, precision="bfloat16"),
+    "triton": Variant(OnTensorCores),
+    "triton, bfloat16": Variant(OnTensorCores, precision="bfloat16"),
 }
 
 
@@ -155,11 +163,15 @@ def measure(env: Any, variant: Variant) -> dict[str, Any]:
             "bytes": torch.cuda.max_memory_allocated(env.device) - before,
         }
         found |= profile(lambda: learn(runner, PROFILED))
+        if not variant.stepwise:
+            alg, repeat = runner.alg, range(PROFILED)
+            found["rollout"] = profile(lambda: [alg.collect(env, alg._seen) for _ in repeat])
+            found["update"] = profile(lambda: [alg.update() for _ in repeat])
     steps = env.num_envs * runner.cfg["num_steps_per_env"]
     return found | {"env-steps/s": 1e3 * steps / found["iteration"]}
 
 
-def profile(work: Callable[[], None]) -> dict[str, Any]:
+def profile(work: Callable[[], Any]) -> dict[str, Any]:
     """Return ms in which kernels were at work, and their number, a call of an iteration; and the longest of them."""
     activities = [torch.profiler.ProfilerActivity.CUDA]
     with torch.profiler.profile(activities=activities) as profiler:
@@ -311,6 +323,9 @@ def main(arguments: list[str] | None = None) -> int:
             lambda: compare(env, VARIANTS["fused, float32"], Unfused, 1)
         )
         print(f"fused against torch, float32, check: {json.dumps(found)}", flush=True)
+    for name in {"triton", "triton, bfloat16"} & {*options.variants}:
+        results[f"{name} against fused"] = found = attempt(lambda: compare(env, VARIANTS[name], CapturedPPO, 1))  # noqa: B023
+        print(f"{name} against fused: {json.dumps(found)}", flush=True)
     print(
         f"{'':32}{'collect':>9}{'learn':>9}{'iteration':>11}{'busy':>9}{'kernels':>9}{'GB':>7}{'first':>9}", flush=True
     )
@@ -325,8 +340,10 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"{name + f', {worlds}':32}{found['collect']:9.2f}{found['learn']:9.2f}{found['iteration']:11.2f}"
                   f"{found['busy']:9.2f}{found['kernels']:9.0f}{found['bytes'] / 1e9:7.2f}"
                   f"{found[f'first {WARM} iterations']:9.0f}", flush=True)  # fmt: skip
-            for kernel, (ms, count) in found["longest [ms, number]"].items() if options.kernels else ():
-                print(f"    {ms:8.3f} ms {count:7.0f}  {kernel}")
+            for part in ("rollout", "update") if options.kernels and "rollout" in found else ():
+                print(f"  {part}: busy {found[part]['busy']:.2f} ms, {found[part]['kernels']:.0f} kernels")
+                for kernel, (ms, count) in found[part]["longest [ms, number]"].items():
+                    print(f"    {ms:8.3f} ms {count:7.0f}  {kernel}")
             if options.json:
                 options.json.write_text(json.dumps(results, indent=1))
     results["a failed capture, check"] = found = attempt(lambda: recover(device))

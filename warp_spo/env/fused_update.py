@@ -44,6 +44,8 @@ class FusedNetwork:
             minibatch. dtype: of products.
     """
 
+    chunk = kernels.CHUNK  # samples of a partial sum of a bias' gradient
+
     def __init__(self, layers: Sequence[nn.Linear], weights: Any, gradients: Any, rows: int, dtype: torch.dtype):
         device = layers[0].weight.device
         self.device = str(wp.device_from_torch(device))
@@ -54,30 +56,39 @@ class FusedNetwork:
         self.results, self.slopes = (
             [torch.empty(rows, layer.out_features, dtype=dtype, device=device) for layer in layers] for _ in range(2)
         )
-        parts = -(-rows // kernels.CHUNK)
+        parts = -(-rows // self.chunk)
         self.sums = [torch.empty(parts, layer.out_features, device=device) for layer in layers[:-1]]
         self.ones = torch.ones(parts, device=device)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the last layer's results without its bias [sample, number]."""
-        for layer, weight, result in zip(self.layers, self.weights, self.results, strict=True):
-            torch.mm(x, weight.t(), out=result)
-            if layer is not self.layers[-1]:
-                threads = -(-len(x) // 4), layer.out_features
-                start(kernels.add_bias_and_elu, threads, [result, layer.bias.detach()], self.device)
-            x = result
-        return x
+        last = len(self.layers) - 1
+        for i in range(last):
+            self._run_layer(i, x)
+            x = self.results[i]
+        return torch.mm(x, self.weights[last].t(), out=self.results[last])
+
+    def _run_layer(self, i: int, x: torch.Tensor) -> None:
+        """Compute the results of a layer of ELU."""
+        result, units = self.results[i], self.layers[i].out_features
+        torch.mm(x, self.weights[i].t(), out=result)
+        bias = self.layers[i].bias.detach()
+        start(kernels.add_bias_and_elu, (-(-len(x) // 4), units), [result, bias], self.device)
 
     def backward(self, x: torch.Tensor) -> None:
         """Compute the gradients of weights from that of the last results, ``slopes[-1]``."""
         for i in reversed(range(len(self.layers))):
-            slope = self.slopes[i]
-            multiply(slope.t(), self.results[i - 1] if i else x, self.gradients[i])
+            multiply(self.slopes[i].t(), self.results[i - 1] if i else x, self.gradients[i])
             if i:
-                below, sums = self.slopes[i - 1], self.sums[i - 1]
-                torch.mm(slope, self.weights[i], out=below)
-                start(kernels.differentiate_elu, sums.shape, [self.results[i - 1], below, sums], self.device)
-                torch.mv(sums.t(), self.ones, out=self.bias_gradients[i - 1])
+                self._differentiate_layer(i - 1)
+                torch.mv(self.sums[i - 1].t(), self.ones, out=self.bias_gradients[i - 1])
+
+    def _differentiate_layer(self, i: int) -> None:
+        """Compute the slopes of a layer of ELU, and parts of their sums, from those of the layer above."""
+        torch.mm(self.slopes[i + 1], self.weights[i + 1], out=self.slopes[i])
+        start(
+            kernels.differentiate_elu, self.sums[i].shape, [self.results[i], self.slopes[i], self.sums[i]], self.device
+        )
 
 
 class FusedUpdate:
@@ -134,8 +145,11 @@ class FusedUpdate:
         self.deviations = alg._raw_actor.distribution.std_param.detach()
         self.deviation_gradient = self.gradient_of[alg._raw_actor.distribution.std_param]
         rows = alg._order.shape[1]
+        kind = FusedNetwork
+        if alg.on_tensor_cores:
+            from .triton_layers import TritonNetwork as kind
         self.actor, self.critic = (
-            FusedNetwork([x for x in model.mlp if isinstance(x, nn.Linear)], factors, slopes, rows, self.dtype)
+            kind([x for x in model.mlp if isinstance(x, nn.Linear)], factors, slopes, rows, self.dtype)
             for model in (alg._raw_actor, alg._raw_critic)
         )
         actions, count = len(self.deviations), alg.num_learning_epochs * alg.num_mini_batches
