@@ -4,9 +4,9 @@
                                  [--variants stock graphs ...] [--kernels] [--train tf32 bfloat16]
 
 ``collect`` and ``learn`` are medians over iterations in ms of wall time, ``iteration`` the whole with the log's rows,
-``busy`` the time in which a kernel of the GPU was at work, ``kernels`` their number. --kernels lists those of rollouts and of
-updates that take longest. A variant that fails has the error in place of times. --train: seconds from the command, with an empty kernel
-cache, to the first checkpoint that walks as ASKED; kernels of the measure itself are compiled apart.
+``busy`` the time in which a kernel was at work, ``kernels`` their number. --kernels lists those of rollouts and of
+updates that take longest. A variant that fails has the error in place of times. --train: seconds from the command,
+with an empty kernel cache, to the first checkpoint that walks as ASKED; kernels of the measure are compiled apart.
 """
 
 from __future__ import annotations

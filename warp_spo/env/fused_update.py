@@ -95,7 +95,8 @@ class FusedUpdate:
     """An update of actor and critic that are layers of ELU, with a Gaussian policy and Adam.
 
     Weights, gradients and Adam's averages of both networks lie in four arrays, of which parameters and the optimizer's
-    state are views. Actor and critic run on two streams up to Adam's step, which is one kernel.
+    state are views. Actor and critic run on two streams up to Adam's step, which is one kernel. Several processes
+    average gradients, and the sums of losses behind them, by one call for a minibatch.
 
     Args:
         alg: whose networks learn; :func:`find_obstacle` says whether they can.
@@ -116,7 +117,9 @@ class FusedUpdate:
                 shapes[i] = len(weight), round_up(weight.shape[1], WIDE)
         sizes = [round_up(math.prod(shape), ALIGNED) for shape in shapes]
         self.border, end = sum(sizes[: len([*models[0].parameters()])]), sum(sizes)
-        flat = [torch.zeros(end, device=device) for _ in range(4)]
+        actions = len(alg._raw_actor.distribution.std_param)
+        self.averaged = torch.zeros(end + 2 * actions + 2, device=device)
+        flat = [self.averaged[:end] if i == 1 else torch.zeros(end, device=device) for i in range(4)]
         self.weights, self.gradients, self.first, self.second = flat
         self.rate = alg._rate.view(1)
         self.copies = torch.zeros(end if self.dtype != torch.float32 else 0, dtype=self.dtype, device=device)
@@ -152,7 +155,7 @@ class FusedUpdate:
             kind([x for x in model.mlp if isinstance(x, nn.Linear)], factors, slopes, rows, self.dtype)
             for model in (alg._raw_actor, alg._raw_critic)
         )
-        actions, count = len(self.deviations), alg.num_learning_epochs * alg.num_mini_batches
+        count = alg.num_learning_epochs * alg.num_mini_batches
         self.terms = torch.empty(rows, 2 * actions + 2, device=device)
         self.value_terms = torch.empty(rows, 2, device=device)
         self.sums = torch.zeros(count, 2 * actions + 2, device=device)
@@ -206,6 +209,12 @@ class FusedUpdate:
                 self._differentiate_critic(batch, k)
             self._differentiate_actor(batch, k)
             alg._join()
+            if alg.is_multi_gpu:
+                totals = self.averaged[len(self.gradients) :].copy_(self.sums[k])
+                average(self.averaged)
+                self._adapt(totals, k)
+                for network in range(2):
+                    self._take_norm(network)
             beta1, beta2 = self.group["betas"]
             numbers = [self.weights, self.gradients, self.first, self.second, self.copies, self.border, self.norms,
                        alg.max_grad_norm, beta1, beta2, self.group["eps"], self.rate, self.corrections]  # fmt: skip
@@ -224,7 +233,8 @@ class FusedUpdate:
         torch.sum(self.value_terms, dim=0, out=self.value_sums[k])
         net.bias_gradients[-1].copy_(self.value_sums[k, :1])
         net.backward(batch.critic)
-        torch.linalg.vector_norm(self.gradients[self.border :], out=self.norms[1])
+        if not alg.is_multi_gpu:
+            self._take_norm(1)
 
     def _differentiate_actor(self, batch: FusedBatch, k: int) -> None:
         alg, net = self.alg, self.actor
@@ -235,12 +245,25 @@ class FusedUpdate:
                    batch.old_log_prob, batch.advantages, alg.clip_param, net.slopes[-1], self.terms]  # fmt: skip
         start(kernels.surrogate_loss, len(means), numbers, self.device)
         torch.sum(self.terms, dim=0, out=self.sums[k])
-        numbers = [self.sums[k], self.deviations, *limits, alg.entropy_coef, alg.desired_kl if alg._adapts else 0.0,
-                   *self.group["betas"], self.deviation_gradient, net.bias_gradients[-1], self.rate,
+        if not alg.is_multi_gpu:
+            self._adapt(self.sums[k], k)
+        net.backward(batch.actor)
+        if not alg.is_multi_gpu:
+            self._take_norm(0)
+
+    def _adapt(self, sums: torch.Tensor, k: int) -> None:
+        """Finish the actor's gradients of deviations and of the last bias, and adapt the rate, by sums of losses."""
+        alg = self.alg
+        limits = alg._raw_actor.distribution.std_range
+        numbers = [sums, self.deviations, *limits, alg.entropy_coef, alg.desired_kl if alg._adapts else 0.0,
+                   *self.group["betas"], self.deviation_gradient, self.actor.bias_gradients[-1], self.rate,
                    self.steps.view(1), self.corrections, self.entropies[k : k + 1]]  # fmt: skip
         start(kernels.adapt, len(self.deviations), numbers, self.device)
-        net.backward(batch.actor)
-        torch.linalg.vector_norm(self.gradients[: self.border], out=self.norms[0])
+
+    def _take_norm(self, network: int) -> None:
+        """Take the norm of a network's gradients: 0: the actor, 1: the critic."""
+        own = self.gradients[self.border :] if network else self.gradients[: self.border]
+        torch.linalg.vector_norm(own, out=self.norms[network])
 
 
 def find_obstacle(alg: Any) -> str:
@@ -256,9 +279,7 @@ def find_obstacle(alg: Any) -> str:
     group = alg.optimizer.param_groups[0]
     if type(alg.optimizer) is not torch.optim.Adam or group["weight_decay"] or group["amsgrad"]:
         return "the optimizer is not Adam without decay"
-    if alg.is_multi_gpu or alg.normalize_advantage_per_mini_batch:
-        return "several processes learn" if alg.is_multi_gpu else "advantages are normalised for each minibatch"
-    return ""
+    return "advantages are normalised for each minibatch" if alg.normalize_advantage_per_mini_batch else ""
 
 
 def start_compiling(device: str) -> None:
@@ -282,6 +303,12 @@ def start(kernel: Any, dim: Any, numbers: Sequence[Any], device: str) -> None:
     scope = wp.ScopedStream(stream(held), sync_enter=False) if held.is_cuda else wp.ScopedDevice(held)
     with scope:
         launch(kernel, dim if isinstance(dim, int) else tuple(dim), arguments, [], device=held)
+
+
+def average(numbers: torch.Tensor) -> None:
+    """Make numbers their means over all processes."""
+    torch.distributed.all_reduce(numbers)
+    numbers /= torch.distributed.get_world_size()
 
 
 def multiply(a: torch.Tensor, b: torch.Tensor, out: torch.Tensor) -> None:
