@@ -17,7 +17,7 @@ from ..runtime.launches import launch
 from ..runtime.torch_tensors import stream
 
 ALIGNED = 64  # weights from one array to the next: products read and write whole lines of memory
-WIDE = 8  # entries that products read at once: rows of inputs and of the first weights are filled up with zeros
+WIDE = 16  # what products take at once: inputs of the first layer and results of the last are filled up with zeros
 
 _compiling: list[threading.Thread] = []  # what start_compiling has begun
 
@@ -54,14 +54,14 @@ class FusedNetwork:
         self.gradients = [gradients[layer.weight] for layer in layers]
         self.bias_gradients = [gradients[layer.bias] for layer in layers]
         self.results, self.slopes = (
-            [torch.empty(rows, layer.out_features, dtype=dtype, device=device) for layer in layers] for _ in range(2)
+            [torch.zeros(rows, len(weight), dtype=dtype, device=device) for weight in self.weights] for _ in range(2)
         )
         parts = -(-rows // self.chunk)
         self.sums = [torch.empty(parts, layer.out_features, device=device) for layer in layers[:-1]]
         self.ones = torch.ones(parts, device=device)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the last layer's results without its bias [sample, number]."""
+        """Return the last layer's results without its bias [sample, number and more]."""
         last = len(self.layers) - 1
         for i in range(last):
             self._run_layer(i, x)
@@ -113,8 +113,11 @@ class FusedUpdate:
         parameters = [weight for model in models for weight in model.parameters()]
         shapes = [tuple(weight.shape) for weight in parameters]
         for i, weight in enumerate(parameters):
-            if any(weight is model.mlp[0].weight for model in models):
-                shapes[i] = len(weight), round_up(weight.shape[1], WIDE)
+            for model in models:
+                if weight is model.mlp[0].weight:
+                    shapes[i] = shapes[i][0], round_up(shapes[i][1], WIDE)
+                if weight is model.mlp[-1].weight:
+                    shapes[i] = round_up(shapes[i][0], WIDE), shapes[i][1]
         sizes = [round_up(math.prod(shape), ALIGNED) for shape in shapes]
         self.border, end = sum(sizes[: len([*models[0].parameters()])]), sum(sizes)
         actions = len(alg._raw_actor.distribution.std_param)
@@ -129,7 +132,7 @@ class FusedUpdate:
         begin = 0
         for weight, shape, size in zip(parameters, shapes, sizes, strict=True):
             parts = [each[begin : begin + math.prod(shape)].view(shape) for each in (*flat, self.copies) if len(each)]
-            own = [part[:, : weight.shape[1]] if weight.ndim == 2 else part for part in parts]
+            own = [part[: len(weight), : weight.shape[1]] if weight.ndim == 2 else part for part in parts]
             state = alg.optimizer.state.get(weight)
             own[0].copy_(weight.detach())
             if state:

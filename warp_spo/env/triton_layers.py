@@ -91,9 +91,12 @@ class Tile(NamedTuple):
 
 
 def fit(tile: Tile, units: int, inputs: int, size: int) -> Tile:
-    """Return a tile that is not wider than a layer."""
+    """Return a tile that is not wider than a layer, whose numbers have so many bytes."""
     least = lambda count: max(16, triton.next_power_of_2(count))  # noqa: E731
-    return tile._replace(units=min(tile.units, least(units)), inputs=min(tile.inputs * 4 // size, least(inputs)))
+    found = min(tile.inputs * 4 // size, least(inputs))
+    while inputs % 16 == 0 and inputs % found:
+        found //= 2
+    return tile._replace(units=min(tile.units, least(units)), inputs=found)
 
 
 FORWARD, BACKWARD = Tile(128, 128, 32), Tile(128, 128, 32)
