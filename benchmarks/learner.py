@@ -52,12 +52,6 @@ class Unfused(CapturedPPO):
     fuses = False
 
 
-class OnTensorCores(CapturedPPO):
-    """Products, ELU and its slope are one kernel."""
-
-    on_tensor_cores = True
-
-
 class ActingCaptured(Unfused):
     """rsl_rl's update with acting as a graph."""
 
@@ -102,8 +96,6 @@ VARIANTS = {
     "fused": Variant(CapturedPPO),
     "fused, float32": Variant(CapturedPPO, precision="float32"),
     "fused, bfloat16": Variant(CapturedPPO, precision="bfloat16"),
-    "triton": Variant(OnTensorCores),
-    "triton, bfloat16": Variant(OnTensorCores, precision="bfloat16"),
 }
 
 
@@ -275,9 +267,6 @@ def main(arguments: list[str] | None = None) -> int:
             lambda: compare(env, VARIANTS["fused, float32"], Unfused, 1)
         )
         print(f"fused against torch, float32, check: {json.dumps(found)}", flush=True)
-    for name in {"triton", "triton, bfloat16"} & {*options.variants}:
-        results[f"{name} against fused"] = found = attempt(lambda: compare(env, VARIANTS[name], CapturedPPO, 1))  # noqa: B023
-        print(f"{name} against fused: {json.dumps(found)}", flush=True)
     print(
         f"{'':32}{'collect':>9}{'learn':>9}{'iteration':>11}{'busy':>9}{'kernels':>9}{'GB':>7}{'first':>9}", flush=True
     )

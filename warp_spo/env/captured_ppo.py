@@ -47,7 +47,6 @@ class CapturedPPO(PPO):
     _learning: Captured
     obstacle = ""
     captures = True  # False: the same without graphs
-    on_tensor_cores = False
     fuses: bool | None = None  # whether updates take few kernels, :class:`FusedUpdate`; None: on CUDA, where they can
 
     def __init__(self, *arguments: Any, **options: Any):
