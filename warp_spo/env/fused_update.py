@@ -132,7 +132,7 @@ class FusedUpdate:
                 self.steps.copy_(state["step"])
             alg.optimizer.state[weight] = {"step": self.steps, "exp_avg": own[2], "exp_avg_sq": own[3]}
             weight.data = own[0]
-            held[weight] = FusedParameter(*parts[:2], parts[4 if len(parts) > 4 else 0])
+            held[weight] = FusedParameter(parts[0], parts[1], parts[4 if len(parts) > 4 else 0])
             self.gradient_of[weight] = own[1]
             begin += size
         self.group = alg.optimizer.param_groups[0]
@@ -293,14 +293,14 @@ def start(kernel: Any, dim: Any, numbers: Sequence[Any], device: str, block: int
         launch(kernel, dim if isinstance(dim, int) else tuple(dim), arguments, [], device=held, block_dim=block)
 
 
-def pairs(x: torch.Tensor) -> wp.array:
+def pairs(x: torch.Tensor) -> Any:
     """Return the words of two numbers of a matrix, float32 or bfloat16."""
     if x.dtype == torch.float32:
         return wp.from_torch(x.view(torch.int64), dtype=wp.uint64, requires_grad=False)
     return wp.from_torch(x.view(torch.int32), dtype=wp.uint32, requires_grad=False)
 
 
-def vectors(x: torch.Tensor) -> wp.array:
+def vectors(x: torch.Tensor) -> Any:
     """Return vectors of two numbers of an array."""
     return wp.from_torch(x.view(*x.shape[:-1], -1, 2), dtype=wp.vec2f, requires_grad=False)
 
