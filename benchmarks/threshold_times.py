@@ -3,8 +3,7 @@
     python -m benchmarks.threshold_times go2-flat ant --seeds 0 --json benchmarks/results/training/THRESHOLDS.json
                                          [--precision bfloat16] [--every 20] [--keep FOLDER]
 
-Each training is ``python -m warp_spo.train TASK``, alone on the device, with caches of Warp and Triton that are empty
-and no --logger. Afterwards its checkpoints are measured, the earliest first, until one meets all of ASKED; its seconds
+Each training is ``python -m warp_spo.train TASK``, alone on the device, with an empty cache of kernels and no --logger. Afterwards its checkpoints are measured, the earliest first, until one meets all of ASKED; its seconds
 are those of its row, from the start of the process. --keep keeps that checkpoint. Exit status 1: one met them not.
 """
 
@@ -61,12 +60,12 @@ def train(name: str, device: str, precision: str, seed: int, every: int, keep: P
     asked, chosen = ASKED[name], task(name)
     every = every or asked.every
     with tempfile.TemporaryDirectory() as folder:
-        caches = {"WARP_CACHE_PATH": f"{folder}/warp", "TRITON_CACHE_DIR": f"{folder}/triton"}
+        own = {**os.environ, "WARP_CACHE_PATH": f"{folder}/cache"}
         command = [sys.executable, "-m", "warp_spo.train", name, "--device", device, "--profile-start", "--logger",
                    "none", "--precision", precision, "--seed", str(seed), "--iterations", str(asked.iterations),
                    "--save-interval", str(every), "--out", f"{folder}/run"]  # fmt: skip
         began = time.time()
-        done = subprocess.run(command, env={**os.environ, **caches}, capture_output=True, text=True)
+        done = subprocess.run(command, env=own, capture_output=True, text=True)
         found: dict[str, Any] = {"asked": asked.seconds, "process": time.time() - began}
         found["start"] = [line.strip() for line in done.stdout.splitlines() if " s  " in line[:14]]
         found["warnings"] = [line for line in done.stderr.splitlines() if "Warning: train" in line]
