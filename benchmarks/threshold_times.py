@@ -3,8 +3,9 @@
     python -m benchmarks.threshold_times go2-flat ant --seeds 0 --json benchmarks/results/training/THRESHOLDS.json
                                          [--precision bfloat16] [--every 20] [--keep FOLDER]
 
-Each training is ``python -m warp_spo.train TASK``, alone on the device, with an empty cache of kernels and no --logger. Afterwards its checkpoints are measured, the earliest first, until one meets all of ASKED; its seconds
-are those of its row, from the start of the process. --keep keeps that checkpoint. Exit status 1: one met them not.
+Each training is ``python -m warp_spo.train TASK``, alone on the device, with an empty cache of kernels and no logger.
+Afterwards its checkpoints are measured, the earliest first, until one meets all of ASKED; its seconds are those of its
+row, from the start of the process. --keep keeps that checkpoint. Exit status 1: one met them not.
 """
 
 from __future__ import annotations
