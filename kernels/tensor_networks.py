@@ -20,6 +20,7 @@ PITCH = 40  # of the inputs of 32 rows in shared memory: four inputs of eight ro
 MOST_INPUTS, MOST_UNITS = 16, 64
 BOUNDED = ("softsign", "tanh")
 PAIRS = True  # softsign takes one reciprocal for two sums
+TILES = 2  # of 16 rows side by side
 
 
 class NetworkShape(NamedTuple):
@@ -97,15 +98,17 @@ struct on_tensor_cores
 
 
 def define(name: str, shape: NetworkShape) -> str:
-    """Return the definition of ``name::tile(staged, weights, sums)``, which needs PRODUCTS.
+    """Return the definition of ``name::tiles(staged, weights, sums)``, which needs PRODUCTS.
 
-    A warp calls it for 16 rows of inputs in shared memory, [input, PITCH]. Lane 4 g + t gets the sums of the last
-    layer of rows g and g + 8. The code is short on purpose: fetching it takes as long as running it.
+    A warp calls it for TILES of 16 rows of inputs in shared memory, [input, PITCH]. Lane 4 g + t gets the sums of the
+    last layer of rows g, g + 8, and so on, side by side. The code is short on purpose: fetching it takes as long as
+    running it.
     """
+    each_tile = f"for (int m = 0; m < {TILES}; ++m) "
     text = [
         f"struct {name} {{",
         *_activation(shape.activation),
-        "static __device__ inline void tile(const float* staged, const float* weights, float* sums)",
+        "static __device__ inline void tiles(const float* staged, const float* weights, float* sums)",
         "{",
         "const int lane = threadIdx.x & 31, t = lane & 3, g = lane >> 2;",
     ]
@@ -115,31 +118,32 @@ def define(name: str, shape: NetworkShape) -> str:
         weights, biases = shape.places[layer]
         y, before = f"y{layer}", f"y{layer - 1}"
         text += [
-            f"float {y}[{count}][4];",
+            f"float {y}[{TILES}][{count}][4];",
             "#pragma unroll",
             f"for (int n = 0; n < {count}; ++n) {{",
             f"const float2 b = *(const float2*)(weights + {biases} + 8 * n + 2 * t);",
-            f"{y}[n][0] = {y}[n][2] = b.x; {y}[n][1] = {y}[n][3] = b.y;",
+            each_tile + f"{{ {y}[m][n][0] = {y}[m][n][2] = b.x; {y}[m][n][1] = {y}[m][n][3] = b.y; }}",
             "}",
             "#pragma unroll",
             f"for (int step = 0; step < {steps}; ++step) {{",
-            "unsigned high[4], low[4];",
+            f"unsigned high[{TILES}][4], low[{TILES}][4];",
             "#pragma unroll",
+            each_tile,
             "for (int i = 0; i < 4; ++i) {",
         ]
         if first:
             text += [
-                f"const float x = staged[(8 * step + t + 4 * (i / 2)) * {PITCH} + g + 8 * (i & 1)];",
-                "high[i] = __float_as_uint(x) & 0xffffe000u;  // NaN and infinity stay what they are",
-                "low[i] = __float_as_uint(x - __uint_as_float(high[i])) + 0x1000u;  // rounded when it is read",
+                f"const float x = staged[(8 * step + t + 4 * (i / 2)) * {PITCH} + 16 * m + g + 8 * (i & 1)];",
+                "high[m][i] = __float_as_uint(x) & 0xffffe000u;  // NaN and infinity stay what they are",
+                "low[m][i] = __float_as_uint(x - __uint_as_float(high[m][i])) + 0x1000u;  // rounded when it is read",
             ]
         else:
             text += [
-                f"const float* x = {before}[2 * step + i / 2] + 2 * (i & 1);",
+                f"const float* x = {before}[m][2 * step + i / 2] + 2 * (i & 1);",
                 "float a, b;",
-                "high[i] = on_tensor_cores::to_half(x[0], x[1]);",
-                "on_tensor_cores::from_half(high[i], a, b);",
-                "low[i] = on_tensor_cores::to_half(x[0] - a, x[1] - b);",
+                "high[m][i] = on_tensor_cores::to_half(x[0], x[1]);",
+                "on_tensor_cores::from_half(high[m][i], a, b);",
+                "low[m][i] = on_tensor_cores::to_half(x[0] - a, x[1] - b);",
             ]
         text += [
             "}",
@@ -152,28 +156,32 @@ def define(name: str, shape: NetworkShape) -> str:
         for part, b0, b1 in (("low", "x", "y"), ("high", "z", "w"), ("high", "x", "y")):
             text += [
                 "#pragma unroll",
-                f"for (int n = 0; n < {count}; ++n) {product}({y}[n], {part}, w[n].{b0}, w[n].{b1});",
+                f"for (int n = 0; n < {count}; ++n) {each_tile}{product}({y}[m][n], {part}[m], w[n].{b0}, w[n].{b1});",
             ]
         text += [
             "}",
             "#pragma unroll",
             f"for (int n = 0; n < {count}; ++n) {{",
-            f"activate({y}[n][0], {y}[n][1], {shape.scales[layer]!r}f);",
-            f"activate({y}[n][2], {y}[n][3], {shape.scales[layer]!r}f);",
+            each_tile + "{",
+            f"activate({y}[m][n][0], {y}[m][n][1], {shape.scales[layer]!r}f);",
+            f"activate({y}[m][n][2], {y}[m][n][3], {shape.scales[layer]!r}f);",
+            "}",
             "}",
         ]
     last, bias = shape.places[len(shape.units)]
     y, count = f"y{len(shape.units) - 1}", shape.units[-1] // 8
     text += [
-        "sums[0] = sums[1] = 0.0f;",
+        f"for (int i = 0; i < {2 * TILES}; ++i) sums[i] = 0.0f;",
         "#pragma unroll",
         f"for (int n = 0; n < {count}; ++n) {{",
         f"const float2 w = *(const float2*)(weights + {last} + 8 * n + 2 * t);",
-        f"sums[0] = __fmaf_rn({y}[n][0], w.x, __fmaf_rn({y}[n][1], w.y, sums[0]));",
-        f"sums[1] = __fmaf_rn({y}[n][2], w.x, __fmaf_rn({y}[n][3], w.y, sums[1]));",
+        each_tile + "{",
+        f"sums[2 * m] = __fmaf_rn({y}[m][n][0], w.x, __fmaf_rn({y}[m][n][1], w.y, sums[2 * m]));",
+        f"sums[2 * m + 1] = __fmaf_rn({y}[m][n][2], w.x, __fmaf_rn({y}[m][n][3], w.y, sums[2 * m + 1]));",
+        "}",
         "}",
         "#pragma unroll",
-        "for (int i = 0; i < 2; ++i) {",
+        f"for (int i = 0; i < {2 * TILES}; ++i) {{",
         "sums[i] += __shfl_xor_sync(0xffffffffu, sums[i], 1);",
         "sums[i] += __shfl_xor_sync(0xffffffffu, sums[i], 2);",
         f"sums[i] += weights[{bias}];",

@@ -238,7 +238,7 @@ class _SegmentProgram:
         kernel, layout, table, looks_up, _ = found
         routine, T = self.job.routine, self.run.dtype
         cpu = kernel.cpu()
-        cuda = kernel.cuda()  # fills the tables
+        cuda = kernel.cuda(("tau_row", layout.wait_for_helpers) if layout.helpers else None)  # fills the tables
         registers = self._registers(layout)
         if places := self.plan.spill_slots(
             routine, layout.shared_bytes(T), wp.types.type_size_in_bytes(T), layout.warps
