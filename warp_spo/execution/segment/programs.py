@@ -141,7 +141,7 @@ class _SegmentProgram:
         passes = self._make_pass_loop(traced, guesses)
         sent = self.sent + (2 * schedule.warps if guesses else 0)
         whole = [item for item in everything if item.array == "out"]
-        layout = self.builder.layout(job, whole, everything, sent, schedule.warps)
+        layout = self.builder.layout(job, whole, everything, sent, schedule.warps, helps=not guesses)
         if not self._fits(layout):
             return None
         kernel = WarpSpecializedKernel(schedule, self.dtype, passes)

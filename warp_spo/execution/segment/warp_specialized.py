@@ -177,8 +177,8 @@ class WarpSpecializedKernel:
         """Return a branch for each structure of leaf segments, which the warps of these segments enter together.
 
         Args:
-            awaited: a row that others write meanwhile, ``name_row``, and code that waits for it; each warp runs that
-                code once, before it reads the row.
+            awaited: a row that others write meanwhile, ``name_row``, and code that waits for it, not in passes until
+                guesses were right; each warp runs that code once, before it reads the row.
         """
         kinds: dict[tuple, list[SegmentCode]] = {}
         for work in self._work.values():
@@ -198,14 +198,17 @@ class WarpSpecializedKernel:
                     self._final_stores(equal),
                 ]
             text.append("}")
-        return self._in_passes("\n".join(text)) if self.passes else "\n".join(text)
+        whole = self._in_passes("\n".join(text)) if self.passes else "\n".join(text)
+        if awaited and awaited[0] in whole.split(awaited[1])[0]:  # it is read before the sweeps of leaves
+            return "\n".join([awaited[1], whole.replace(awaited[1], ";")])
+        return whole
 
     def _wait(self, inward: str, row: str, code: str) -> str:
         """Return the inward sweep of leaves with code before the first line that reads a row, in the first pass."""
-        loops = self.passes is not None and (self.passes.counted or self.passes.flags is not None)
         lines = inward.split("\n")
         at = next((at for at, line in enumerate(lines) if row in line), len(lines))
-        return "\n".join([*lines[:at], f"if (turn == 0) {code}" if loops else code, *lines[at:]])
+        first = "if (turn == 0) " if self.passes is not None and self.passes.counted else ""
+        return "\n".join([*lines[:at], first + code, *lines[at:]])
 
     def _in_passes(self, a_pass: str) -> str:
         """Return ``a_pass`` in a loop, then the final messages of every segment, then the final stores."""
