@@ -18,11 +18,10 @@ import json
 import statistics
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from warp_spo.env import learning
+from warp_spo.env import learning, loggers
 from warp_spo.env.state_copies import StateCopies
 from warp_spo.env.task_files import robot_file
 from warp_spo.env.tasks import task
@@ -41,16 +40,13 @@ class Training:
     """A training that goes on turn by turn.
 
     Args:
-        chosen: the task. options: of the command. folder: of its rows. loggers: beside the rows.
-        kept: further arguments of its environment.
+        chosen: the task. options: of the command. folder: of its rows. kept: further arguments of its environment.
     """
 
-    def __init__(
-        self, chosen: Any, options: argparse.Namespace, folder: Path, loggers: Sequence[str] = (), **kept: Any
-    ):
+    def __init__(self, chosen: Any, options: argparse.Namespace, folder: Path, **kept: Any):
         self.env = chosen.build(options.worlds, options.device, seed=0, **kept)
         self.runner, _ = learning.prepare(
-            self.env, chosen.LEARNER, folder, 10**6, save_interval=10**6, every=10**6, loggers=loggers
+            self.env, chosen.LEARNER, folder, 10**6, save_interval=10**6, every=10**6, loggers=()
         )
         self.runner.save_all = lambda *_: None  # each turn would end with a checkpoint
         self.file, self.rows = robot_file(chosen), folder / "progress.jsonl"
@@ -80,6 +76,16 @@ class Training:
         finally:
             self.runner.watchers.remove(copies.copy)
             view.close()
+
+    @contextlib.contextmanager
+    def logger(self) -> Any:
+        """Log to TensorBoard, too, inside; a context manager."""
+        log: Any = self.runner.logger
+        log._open = {LOGGED: loggers.start("tensorboard", self.rows.parent, 0, {})}
+        try:
+            yield
+        finally:
+            log.close()
 
 
 def _watch(training: Training, copies: StateCopies, times: dict[str, list[float]], iterations: int) -> None:
@@ -112,14 +118,12 @@ def main(arguments: list[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         plain = Training(chosen, options, folder / "plain")
-        others: dict[str, Training] = {}
-        if LOGGED in states:
-            others[LOGGED] = Training(chosen, options, folder / "logged", ("tensorboard",))
+        kept = None
         if KEPT in states:
-            others[KEPT] = Training(chosen, options, folder / "kept", keep_failures=folder / "failures")
-            print(others[KEPT].env._failures.describe(), flush=True)
+            kept = Training(chosen, options, folder / "kept", keep_failures=folder / "failures")
+            print(kept.env._failures.describe(), flush=True)
         copies = StateCopies(plain.env)
-        for each in (plain, *others.values()):
+        for each in filter(None, (plain, kept)):
             each.learn(options.iterations)  # compiles and warms up
         print(f"begins after {time.monotonic() - began:.0f} s", flush=True)
         for number in range(options.rounds):
@@ -128,10 +132,12 @@ def main(arguments: list[str] | None = None) -> int:
             times[PLAIN].append(plain.learn(options.iterations))
             if PAGE in states or WATCHED in states:
                 _watch(plain, copies, times, options.iterations)
-            for state, training in others.items():
-                times[state].append(training.learn(options.iterations))
-        files = len(others[KEPT].env.failure_files()) if KEPT in others else 0
-        ring = others[KEPT].env._failures.bytes if KEPT in others else 0
+            if LOGGED in states:
+                with plain.logger():
+                    times[LOGGED].append(plain.learn(options.iterations))
+            if kept is not None:
+                times[KEPT].append(kept.learn(options.iterations))
+        files, ring = (0, 0) if kept is None else (len(kept.env.failure_files()), kept.env._failures.bytes)
     ratios = {
         state: [row / base - 1.0 for row, base in zip(times[state], times[PLAIN], strict=True)] for state in states
     }
