@@ -40,7 +40,7 @@ class CapturedPPO(PPO):
 
     Attributes:
         obstacle: why it learns as in rsl_rl; "" where it does not. deviation: mean deviation of actions.
-        log: what ``env.log()`` said after the rollout.
+        log: what ``env.log()`` said after the rollout. meanwhile: called before an update waits for the device.
     """
 
     learning_rate: float
@@ -74,6 +74,7 @@ class CapturedPPO(PPO):
         self._kept: tuple[torch.Tensor, ...] = ()  # what was learned before this update
         self._kept_rate = 0.0
         self.deviation = torch.zeros(())
+        self.meanwhile: Callable[[], None] = lambda: None
         self.log, self._log_values = dict[str, float](), torch.zeros(0, device=self.device)
         self._adopt()
 
@@ -192,7 +193,9 @@ class CapturedPPO(PPO):
             self._learning()
             self.storage.clear()
             size = len(self._found)
-            numbers = torch.cat([self._found, self._log_values]).tolist()  # the one wait for the device
+            held = torch.cat([self._found, self._log_values])
+            self.meanwhile()
+            numbers = held.tolist()  # the one wait for the device
             *means, rate, deviation, finite = numbers[:size]
             self.log = dict(zip(self._log_names, numbers[size:], strict=True))
             self.learning_rate, self.deviation = rate, torch.tensor(deviation)
