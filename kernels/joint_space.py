@@ -23,7 +23,7 @@ from .elementary import C_TYPE, FUSED
 
 WORDS = {"PIVOT": 1, "NOT_FINITE": 2, "CONTACT": 8, "CROWDED": 9}
 """Status words, as warp_spo.Status, which kernels cannot import; a test compares."""
-BLOCK = 32  # threads of a block: a warp
+BLOCK = WARP = 32  # threads of a block, and of a warp
 MOST, POINT = 8, 7  # points of a near pair; entries of a point: place, normal towards the first body, depth
 SURFACE = 11
 """Entries of a surface of the ground at a point: place, normal, depth; push and damping of its law; gap; 1 where the
@@ -110,7 +110,7 @@ def shared_layout(sizes: Sizes, T: type) -> tuple[dict[str, int], int]:
     b, real = sizes.tiles, 4 if T is wp.float32 else 8
     starts, at = {}, 0
     reals = {
-        "AT_A": max(4 * (b * (b + 1) // 2 + b), SCREW * sizes.dofs, 5 * BLOCK), "AT_J": 6 * sizes.columns * sizes.slots,
+        "AT_A": max(4 * (b * (b + 1) // 2 + b), SCREW * sizes.dofs, 5 * WARP), "AT_J": 6 * sizes.columns * sizes.slots,
         "AT_SLOT": SLOT_FIELDS * sizes.slots, "AT_DOF": DOF_FIELDS * 2 * b, "AT_M": sizes.entries,
         "AT_SHARE": sizes.laws,
     }  # fmt: skip
