@@ -85,25 +85,22 @@ for (int number = pass_count - 1; number >= 0; --number) {
     // -- lambda
     LOOP
     for (int j = 0; j < NB; ++j) {
-        const REAL l10 = now_dof[L10 * N + j], y0 = lambda[2 * j] * now_dof[I0 * N + j];
-        const REAL y1 = FMA(-l10, y0, lambda[2 * j + 1]) * now_dof[I1 * N + j];
-        EACH (a, count[j] - 1) {
-            const int row = rows[j * (NB + 1) + a];
+        const unsigned short* const rows = list + start[j] + 1;
+        REAL y0 = lambda[2 * j], y1 = lambda[2 * j + 1];
+        joint_space::divide(now_dof[I0 * N + j], now_dof[L10 * N + j], now_dof[I1 * N + j], y0, y1);
+        EACH (a, start[j + 1] - start[j] - 2) {
+            const int row = rows[a] >> 8;
             const REAL* const x = kept + 4 * joint_space::tile(row, j);
             lambda[2 * row] = FMA(-x[1], y1, FMA(-x[0], y0, lambda[2 * row]));
             lambda[2 * row + 1] = FMA(-x[3], y1, FMA(-x[2], y0, lambda[2 * row + 1]));
         }
         SYNC
-        if (lane == 0) {
-            lambda[2 * j] = y0;
-            lambda[2 * j + 1] = y1;
-        }
     }
     SYNC
     LOOP
     for (int j = NB - 1; j >= 0; --j) {
-        const REAL x1 = lambda[2 * j + 1] * now_dof[I1 * N + j];
-        const REAL x0 = FMA(-now_dof[L10 * N + j], x1, lambda[2 * j]) * now_dof[I0 * N + j];
+        REAL x0 = lambda[2 * j], x1 = lambda[2 * j + 1];
+        joint_space::divide(now_dof[I0 * N + j], now_dof[L10 * N + j], now_dof[I1 * N + j], x0, x1);
         EACH (k, j) {
             const REAL* const x = kept + 4 * joint_space::tile(j, k);
             lambda[2 * k] = FMA(-x[2], x1, FMA(-x[0], x0, lambda[2 * k]));
@@ -311,17 +308,16 @@ for (int number = pass_count - 1; number >= 0; --number) {
     SYNC
     // -- by the velocities of points: to the pass before; from the first one, to the rates before the step
     REAL *const to = first ? v0_b : x_b, *const by = first ? u0_b : u_b;
-    LOOP
-    for (int k = 0; k < runs; ++k) {
-        const int* const row = table + T_COUPLE + (1 + MB) * run_couple[k];
-        EACH (b, row[0]) {
-            REAL sum[2] = {0, 0};
-            for (int at = run_start[k]; at < run_start[k + 1]; ++at)
-                joint_space::push(J + (at * MB + b) * 6, by + 3 * at, 1, sum);
-            for (int d = 0; d < 2; ++d) to[2 * (row[1 + b] & 255) + d] += sum[d];
-        }
-        SYNC
+    EACH (j, NB) {
+        REAL sum[2] = {0, 0};
+        for (int w = 0; w < SLOT_WORDS; ++w)
+            for (unsigned int left = touching[j * SLOT_WORDS + w]; left; left &= left - 1) {
+                const int at = 32 * w + joint_space::first_of(left), c = joint_space::rank(slot_mask + at * WORDS, j);
+                joint_space::push(J + (at * MB + c) * 6, by + 3 * at, 1, sum);
+            }
+        for (int d = 0; d < 2; ++d) to[2 * j + d] += sum[d];
     }
+    SYNC
     EACH (i, N) lambda[i] = x_b[i];
     SYNC
 }

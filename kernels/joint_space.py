@@ -6,9 +6,11 @@ has code of its own: numbers of dofs, pairs and slots are constants, and what th
 value is computed by one lane, in an order that does not depend on ``LANES``; so results have equal bits for any number
 of worlds and lanes.
 
-Dofs are grouped by two, so that A consists of 2 x 2 tiles; the right side is one more row of tiles. Rows of a column of
-tiles are listed once a step, from the tree and from the pairs that are near, and what is zero costs nothing. The
-unknown is the change of the velocity, whose rounding errors are those of the change.
+Dofs are grouped by two, so that A consists of 2 x 2 tiles; the right side is one more row of tiles. Tiles that are not
+zero are listed once a step, from the tree and from the pairs that are near. A lane forms a tile from all that it
+consists of, and a pass through a column subtracts x D^-1 y* from the tiles to its right, x and y being tiles of the
+column and D its diagonal one; so factors are A = L D^-1 L*, where L is the columns as they are met. The unknown is the
+change of the velocity, whose rounding errors are those of the change.
 """
 
 from __future__ import annotations
@@ -71,6 +73,7 @@ class Sizes(NamedTuple):
             those with the ground among them.
         surfaces, points: surfaces of the ground at points, each of which has a slot; points with the ground.
         laws: of motors and of springs, beside those that follow from constants of a dof.
+        held: tiles of the mass matrix that are not zero.
     """
 
     dofs: int
@@ -84,17 +87,24 @@ class Sizes(NamedTuple):
     surfaces: int = 0
     points: int = 0
     laws: int = 0
+    held: int = 0
 
     @property
     def words(self) -> int:
-        """How many words of 64 bits a mask of tiles has."""
-        return -(-self.tiles // 64)
+        """How many words of 32 bits a mask of block columns has."""
+        return -(-self.tiles // 32)
+
+    @property
+    def slot_words(self) -> int:
+        """How many words of 32 bits a mask of slots has."""
+        return -(-self.slots // 32)
 
     @property
     def table_starts(self) -> dict[str, int]:
         """Where each table of integers begins in ``place``, in this order, and how long all are."""
         sizes = {
-            "DOF_OF": 2 * self.tiles, "ENTRY": self.entries, "MASK": 2 * self.tiles * self.words,
+            "DOF_OF": 2 * self.tiles, "ENTRY": self.entries, "MASK": self.tiles * self.words,
+            "HELD": self.tiles * (self.tiles + 1) // 2, "BLOCKS": self.couples * self.words,
             "COUPLE": (1 + self.columns) * self.couples, "PAIR": 2 * (self.pairs + self.surfaces),
             "COORDINATE": self.dofs, "ROW_START": 2 * self.tiles + 1,
             "ROW": 2 * self.entries - self.dofs, "LAW": self.dofs + 1,
@@ -111,16 +121,16 @@ def shared_layout(sizes: Sizes, T: type) -> tuple[dict[str, int], int]:
     starts, at = {}, 0
     reals = {
         "AT_A": max(4 * (b * (b + 1) // 2 + b), SCREW * sizes.dofs, 5 * WARP), "AT_J": 6 * sizes.columns * sizes.slots,
-        "AT_SLOT": SLOT_FIELDS * sizes.slots, "AT_DOF": DOF_FIELDS * 2 * b, "AT_M": sizes.entries,
+        "AT_SLOT": SLOT_FIELDS * sizes.slots, "AT_DOF": DOF_FIELDS * 2 * b, "AT_M": 4 * sizes.held,
         "AT_SHARE": sizes.laws,
     }  # fmt: skip
     for name, size in reals.items():
         starts[name], at = at, at + -(-size // 4) * 4
     at *= real
     parts = {
-        "AT_MASK": 8 * b * sizes.words, "AT_RUN": 4 * (2 * (sizes.near + sizes.surfaces) + 3),
-        "AT_SLOT_OF": 4 * sizes.slots, "AT_KEEP": 4 * sizes.near,
-        "AT_COUNT": 4 * b, "AT_ROWS": b * (b + 1),
+        "AT_MASK": 4 * b * sizes.words, "AT_TOUCHING": 4 * b * sizes.slot_words, "AT_ACTIVE": 4 * sizes.slot_words,
+        "AT_SLOT_OF": 4 * sizes.slots, "AT_SLOT_PAIR": 4 * sizes.slots, "AT_SLOT_MASK": 4 * sizes.slots * sizes.words,
+        "AT_KEEP": 4 * sizes.near, "AT_BEGIN": 4 * (sizes.near + 1), "AT_START": 4 * (b + 1), "AT_LIST": b * (b + 3),
     }  # fmt: skip
     for name, size in parts.items():
         starts[name], at = at, at + -(-size // 8) * 8
@@ -154,7 +164,8 @@ def native_text(text: str, sizes: Sizes, T: type, lanes: int, refine: int) -> st
         "MB": sizes.columns, "NEAR": sizes.near, "S": sizes.slots, "BYTES": size, "MOST": MOST, "POINT": POINT,
         "DV": len(DOF_VALUES), "PV": len(PAIR_VALUES), "TILES": sizes.tiles * (sizes.tiles + 1) // 2 + sizes.tiles,
         "REFINE": refine, "SURFACE": SURFACE, "SURFACES": sizes.surfaces, "CONTACT_POINTS": sizes.points,
-        "WORDS": sizes.words, "LAW": LAW, "LAWS": sizes.laws, "SCREW": SCREW,
+        "WORDS": sizes.words, "SLOT_WORDS": sizes.slot_words, "HELD": sizes.held,
+        "LAW": LAW, "LAWS": sizes.laws, "SCREW": SCREW,
     }  # fmt: skip
     constants |= WORDS | starts | {f"T_{name}": at for name, at in sizes.table_starts.items()}
     constants |= {f"C_{name.upper()}": i for i, name in enumerate(DOF_VALUES)}
@@ -172,4 +183,4 @@ def native_text(text: str, sizes: Sizes, T: type, lanes: int, refine: int) -> st
         .replace("REAL", c)
         .replace("FMA(", f"FUSED_{c}(")
     )
-    return FUSED + text.replace("INVERSE_ROOT(", "rsqrtf(" if T is wp.float32 else "rsqrt(")
+    return FUSED + text.replace("QUOTIENT(", "__fdividef(" if T is wp.float32 else "__ddiv_rn(")
