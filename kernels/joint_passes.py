@@ -172,18 +172,22 @@ for (int number = 0;; ++number) {
                 sum.x[3] += dof[D * N + 2 * j + 1];
             }
         }
+        int pair = -1, from_j = 0, from_i = 0;
         LOOP
         for (int w = 0; w < SLOT_WORDS; ++w) {
             LOOP
             for (unsigned int left = to_j[w] & active[w] & (i == NB ? ~0u : to_i[w]); left; left &= left - 1) {
                 const int at = 32 * w + joint_space::first_of(left);
-                const unsigned int* const own = slot_mask + at * WORDS;
-                const REAL* const one = J + (at * MB + joint_space::rank(own, j)) * 6;
+                if (slot_pair[at] != pair) {
+                    pair = slot_pair[at];
+                    from_j = 6 * joint_space::rank(slot_mask + at * WORDS, j);
+                    from_i = i == NB ? 0 : 6 * joint_space::rank(slot_mask + at * WORDS, i);
+                }
+                const REAL *const one = J + at * (6 * MB) + from_j, *const other = J + at * (6 * MB) + from_i;
                 if (i == NB) {
                     joint_space::push(one, slot + F * S + at, S, sum.x);
                     continue;
                 }
-                const REAL* const other = J + (at * MB + joint_space::rank(own, i)) * 6;
                 UNROLL
                 for (int r = 0; r < 3; ++r) {
                     const REAL c = slot[(r ? CT : CN) * S + at];

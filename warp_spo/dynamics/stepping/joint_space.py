@@ -20,8 +20,6 @@ from ...scene.contact_shapes import BOX, CYLINDER, ELLIPSOID, SWEPT_SEGMENT, Con
 from ...scene.ground import HEIGHTS
 from ...scene.scene import Scene
 from ..convex_contacts import PairShape, rotate, shape_rows
-from ..inertia import MASS_MATRIX_PACKED
-from ..kinematics import BODY_STATES
 
 if TYPE_CHECKING:
     from ..dynamics import Dynamics
@@ -258,10 +256,9 @@ class JointSpaceStep:
 
         ``acting``: body_f; ctrl, target_q and target_qd of motors.
         """
-        engine, sizes = self.dyn._engine, self.tables.sizes
-        engine.launch(MASS_MATRIX_PACKED, self.mass, q=q)
-        engine.launch(BODY_STATES, self.poses, {"velocities_out": self.velocities}, q=q, qd=qd)
-        more = {joint_system.SCREWS: self.screws}
+        sizes = self.tables.sizes
+        more = {joint_system.MASS: self.mass, joint_system.POSES: self.poses, joint_system.VELOCITIES: self.velocities}
+        more |= {joint_system.SCREWS: self.screws}
         more |= {joint_system.SURFACES: self.surfaces} if sizes.surfaces else {}
         if self.names is not None:
             more |= {joint_system.OF_DOFS: self.dof_values, joint_system.OF_PAIRS: self.pair_values}
@@ -271,7 +268,7 @@ class JointSpaceStep:
             acting = {name: array for name, array in acting.items() if name == "body_f"}
         options: dict[str, Any] = dict(pairs=tuple(self.tables.pairs), motors=self.motor_laws, names=self.names)
         options["surfaces"] = bool(sizes.surfaces)
-        engine.launch_routine(SYSTEM, self.bias, more, q=q, qd=qd, dt=dt, **acting, **options)
+        self.dyn._engine.launch_routine(SYSTEM, self.bias, more, q=q, qd=qd, dt=dt, **acting, **options)
 
     def step(
         self,

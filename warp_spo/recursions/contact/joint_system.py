@@ -1,6 +1,6 @@
-"""Values of a state that the solver of touching bodies in joint space reads, beside mass matrix and body poses.
+"""Values of a state that the solver of touching bodies in joint space reads.
 
-These are the bias force, the surfaces of the ground at the points that may touch it, and what the laws of joints, pairs
+These are the mass matrix, poses and velocities of bodies, the bias force, the surfaces of the ground at the points that may touch it, and what the laws of joints, pairs
 and points have in a world, of values that are variable or differ between worlds. A surface's point moves along a
 parabola, as :mod:`.points` explains; the push and the depth of its law say so.
 """
@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 from ...trace.emission import Store
 from ...trace.scalars import Value, is_constant, sqrt
 from ...trace.spatial import IDENTITY, ZERO, Vector, dot, total
-from ..kinematics import columns, zero
+from ..composite import mass_matrix_packed
+from ..kinematics import body_poses, body_velocities, columns, zero
 from ..newton_euler import inverse_dynamics
 from ..step import descendants
 from ..step.actuation import build_joint_laws
@@ -24,6 +25,7 @@ from .points import place_points, with_ancestors
 if TYPE_CHECKING:
     from ..model.tracing import Trace
 
+MASS, POSES, VELOCITIES = "mass", "poses", "velocities"
 SCREWS, SURFACES, OF_MOTORS = "screws", "surfaces", "motors"
 OF_DOFS, OF_PAIRS = "dof_values", "pair_values"
 PASSED = "passed"  # array [world, dof]: qd + h qdd, as the last pass leaves it
@@ -55,7 +57,7 @@ def joint_system(
     motors: tuple[int, ...],
     names: tuple[tuple[str, ...], tuple[str, ...]] | None = None,
 ) -> list[Store]:
-    """out = bias force, with gravity compensation; SCREWS; SURFACES; OF_MOTORS; OF_DOFS, OF_PAIRS that are no constants
+    """out = bias force, with gravity compensation; all results above; OF_DOFS and OF_PAIRS that are no constants
 
     ``surfaces``: whether points may touch the ground. ``names``: of the values of dofs, and of pairs; None: all are
     constants. ``pairs``: the order of the scene's pairs, after which the surfaces follow. ``motors``: by dof, how many
@@ -71,6 +73,8 @@ def joint_system(
         own, over = trace.places[id(link)].pose.l, link.parent
         origins[id(link)] = own if over is None else origins[id(over)] + trace.axes[id(over)] @ own
     stores += _screws(trace, origins)
+    for array, found in ((MASS, mass_matrix_packed), (POSES, body_poses), (VELOCITIES, body_velocities)):
+        stores += [item._replace(array=array) for item in found(trace)]
     numbers = _add_surfaces(trace, laws, origins, stores) if surfaces else []
     stores += _motor_laws(trace, laws, motors)
     if names is not None:

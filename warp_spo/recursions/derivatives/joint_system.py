@@ -8,14 +8,11 @@ from ...trace.differentiation import reverse
 from ...trace.emission import Store
 from ...trace.scalars import ordered
 from ..contact import joint_system as system
-from ..kinematics import body_poses
 from .adjoints import gradient_stores
 from .power import Power
 
 if TYPE_CHECKING:
     from ..model.tracing import Trace
-
-POSES = "poses"
 
 
 def joint_system_vjp(
@@ -25,8 +22,8 @@ def joint_system_vjp(
 
     Their cotangents are "screws_bar" and so on. Options are those of :func:`..contact.joint_system.joint_system`.
     """
-    results = [item for item in system.joint_system(trace, surfaces, pairs, motors) if item.array != "out"]
-    results += [Store(POSES, item.index, item.value) for item in body_poses(trace)]
+    left_out = "out", system.MASS, system.VELOCITIES
+    results = [item for item in system.joint_system(trace, surfaces, pairs, motors) if item.array not in left_out]
     return _pull_back(trace, results, {item.array: f"{item.array}_bar" for item in results}, wrt)
 
 
