@@ -10,7 +10,7 @@ import warp as wp
 
 from ...execution.joint_tables import joint_tables, lacking, motor_laws, way_out
 from ...execution.routine import Routine
-from ...kernels import convex_pairs, joint_space, near_pairs
+from ...kernels import convex_pairs, convex_shapes, joint_space, near_pairs
 from ...recursions.contact import coupled, joint_system
 from ...recursions.contact.pairs import PASSES
 from ...recursions.contact.points import surface_numbers
@@ -89,6 +89,11 @@ def choose_slots(scene: Scene) -> tuple[int, int]:
     return min(len(pairs), max(NEAR, NEAR_A_BODY * len(bodies))), sum(points[: max(FULL, len(bodies))])
 
 
+def _routine(one: ConvexShape, other: ConvexShape) -> int:
+    """Return the number of the routine that finds the points of two shapes."""
+    return convex_pairs.routine(*(convex_shapes.KINDS.index(_pair_shape(shape).kind) for shape in (one, other)))
+
+
 def _points(one: ConvexShape, other: ConvexShape) -> int:
     """Return how many points two shapes share at most."""
     round_ones = [shape.kind == SWEPT_SEGMENT and shape.size[2] == 0.0 for shape in (one, other)]
@@ -128,9 +133,9 @@ class JointSpaceStep:
         self.near_count = near = chosen[0] if near is None else near
         self.slot_count = slots = chosen[1] if slots is None else slots
         pattern = dyn.mass_matrix_pattern
-        surfaces = surface_numbers(scene, HEIGHTS in dyn.variable)
+        surfaces, pairs = surface_numbers(scene, HEIGHTS in dyn.variable), scene.contact_pairs
         self.motor_laws = motors = motor_laws(scene, dyn.variable)
-        tables = joint_tables(scene, pattern, near, slots, surfaces, motors)
+        tables = joint_tables(scene, pattern, near, slots, surfaces, motors, [_routine(*x.shapes) for x in pairs])
         sizes = tables.sizes
         least = min(slots, max(LEAST, LEAST_A_BODY * len(scene.bodies)))
         while self.device.is_cuda and slots > least and joint_space.world_bytes(sizes, T) > ROOM:

@@ -1,8 +1,9 @@
 """Values of a state that the solver of touching bodies in joint space reads.
 
-These are the mass matrix, poses and velocities of bodies, the bias force, the surfaces of the ground at the points that may touch it, and what the laws of joints, pairs
-and points have in a world, of values that are variable or differ between worlds. A surface's point moves along a
-parabola, as :mod:`.points` explains; the push and the depth of its law say so.
+These are the mass matrix, poses and velocities of bodies, the bias force, the surfaces of the ground at the points that
+may touch it, and what the laws of joints, pairs and points have in a world, of values that are variable or differ
+between worlds. A surface's point moves along a parabola, as :mod:`.points` explains; the push and the depth of its law
+say so.
 """
 
 from __future__ import annotations
