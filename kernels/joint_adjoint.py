@@ -21,11 +21,12 @@ import warp as wp
 from . import joint_passes, native
 from .joint_space import ARGUMENTS as SOLVED
 from .joint_space import (
-    BLOCK,
     DOF_FIELDS,
     SLOT_FIELDS,
+    WARP,
     Sizes,
     native_text,
+    scratch_size,
     world_bytes,
 )
 
@@ -44,14 +45,13 @@ of contacts [world, contact] they are whole for pairs, and lack what push and da
 """
 
 BEFORE = r"""
-enum { DOF_FIELDS = DOF_COUNT, SLOT_FIELDS = SLOT_COUNT };
 enum { K_DOF = 4 * TILES, K_SLOT = K_DOF + DOF_FIELDS * N, K_SHARE = K_SLOT + SLOT_FIELDS * S, KEPT = K_SHARE + LAWS };
-REAL* const history = work.data + world * work.shape[1];
+REAL* const history = work.data + world * work.shape[1] + KEPT_SLOTS;
 """
 AFTER = r"""
     EACH (i, K_DOF) history[(long long)number * KEPT + i] = s[AT_A + i];
     EACH (i, DOF_FIELDS * N) history[(long long)number * KEPT + K_DOF + i] = dof[i];
-    EACH (i, SLOT_FIELDS * S) history[(long long)number * KEPT + K_SLOT + i] = slot[i];
+    EACH (i, SLOT_FIELDS * slots) history[(long long)number * KEPT + K_SLOT + i] = slot[i];
     EACH (i, LAWS) history[(long long)number * KEPT + K_SHARE + i] = shares[i];
     SYNC
 """
@@ -118,11 +118,12 @@ for (int number = pass_count - 1; number >= 0; --number) {
         const int pair = joint_space::pair_of(nears, slot_of[at]);
         const int* const row = table + T_COUPLE + (1 + MB) * table[T_PAIR + 2 * pair];
         const REAL* const value = pair_value + PV * pair;
-        const REAL kd = now_slot[KD * S + at], mu = value[P_FRICTION], spring = now_slot[PUSH * S + at];
+        const REAL *const now = now_slot + SLOT_FIELDS * at, *const earlier = old_slot + SLOT_FIELDS * at;
+        const REAL kd = now[KD], mu = value[P_FRICTION], spring = now[PUSH];
         REAL u0[3], u[3], damp[3], pushed[3] = {0, 0, 0}, moved[3] = {0, 0, 0};
         for (int r = 0; r < 3; ++r) {
-            u[r] = u0[r] = now_slot[(U0 + r) * S + at];
-            damp[r] = now_slot[(r ? CT : CN) * S + at];
+            u[r] = u0[r] = now[U0 + r];
+            damp[r] = now[r ? CT : CN];
         }
         for (int c = 0; c < row[0]; ++c)
             for (int r = 0; r < 3; ++r)
@@ -134,12 +135,12 @@ for (int number = pass_count - 1; number >= 0; --number) {
                     if (!first) u[r] = FMA(each, old_x[i], u[r]);
                 }
         // the law of this pass: along, across and force by the velocity that the pass before found
-        const int flags = (int)now_slot[FLAG * S + at], were = first ? 0 : (int)old_slot[FLAG * S + at];
+        const int flags = (int)now[FLAG], were = first ? 0 : (int)earlier[FLAG];
         const bool closed = flags & 1, candidate = flags & 2, shut = were & 1;
-        const REAL across = now_slot[ACROSS * S + at], push = FMA(-kd, u[0], spring);
+        const REAL across = now[ACROSS], push = FMA(-kd, u[0], spring);
         const REAL slip = sqrt(FMA(u[1], u[1], u[2] * u[2]));
         const bool pushes = (first ? candidate : shut) && push > 0;
-        const REAL fn = pushes ? push : 0, before = first ? 0 : old_slot[ACROSS * S + at];
+        const REAL fn = pushes ? push : 0, before = first ? 0 : earlier[ACROSS];
         const REAL over = first ? 0 : joint_space::positive(FMA(before, slip, -(mu * fn)));
         const REAL w = FMA(h * value[P_WEIGHT], over, slip);
         const REAL squared = FMA(w, w, value[P_EPS] * value[P_EPS]), rigid = (REAL)RIGID / (h * value[P_WEIGHT]);
@@ -180,7 +181,7 @@ for (int number = pass_count - 1; number >= 0; --number) {
             for (int r = 0; r < 3; ++r)
                 for (int d = 0; d < 2; ++d) {
                     const int i = 2 * (row[1 + c] & 255) + d;
-                    const REAL load = FMA(-damp[r], moved[r], now_slot[(F + r) * S + at]);
+                    const REAL load = FMA(-damp[r], moved[r], now[F + r]);
                     REAL more = FMA(load, lambda[i], -(damp[r] * pushed[r]) * now_x[i]);
                     if (!first) more = FMA(by_u[r], old_x[i], more);
                     J_b[(at * MB + c) * 6 + 2 * r + d] += more;
@@ -313,7 +314,7 @@ for (int number = pass_count - 1; number >= 0; --number) {
         for (int w = 0; w < SLOT_WORDS; ++w)
             for (unsigned int left = touching[j * SLOT_WORDS + w]; left; left &= left - 1) {
                 const int at = 32 * w + joint_space::first_of(left), c = joint_space::rank(slot_mask + at * WORDS, j);
-                joint_space::push(J + (at * MB + c) * 6, by + 3 * at, 1, sum);
+                joint_space::push(J + (at * MB + c) * 6, by + 3 * at, sum);
             }
         for (int d = 0; d < 2; ++d) to[2 * j + d] += sum[d];
     }
@@ -383,7 +384,7 @@ EACH (contact, stiffness_bar.shape[1]) {
         if (table[T_PAIR + 2 * pair + 1] != contact) continue;
         const bool ground = pair >= PAIRS;
         const REAL share = ground ? 1 : (REAL)1 / nears[1 + NEAR + where / MOST];
-        by[0] += ground ? h * kd_b[at] : share * FMA(slot[DEPTH * S + at], spring_b[at], h * kd_b[at]);
+        by[0] += ground ? h * kd_b[at] : share * FMA(slot[SLOT_FIELDS * at + DEPTH], spring_b[at], h * kd_b[at]);
         by[1] += ground ? 0 : share * kd_b[at];
         by[2] += mu_b[at];
     }
@@ -428,17 +429,17 @@ EACH (own, DOFS) {
 """
 
 
-def work_size(sizes: Sizes, passes: int) -> int:
-    """Return how many scalars of memory a world takes for so many passes."""
+def work_size(sizes: Sizes, T: type, passes: int) -> int:
+    """Return how many scalars of memory a world takes for so many passes, a multiple of four."""
     n, tiles = 2 * sizes.tiles, sizes.tiles * (sizes.tiles + 1) // 2 + sizes.tiles
     kept = 4 * tiles + DOF_FIELDS * n + SLOT_FIELDS * sizes.slots + sizes.laws
-    return passes * kept + 5 * n + sizes.laws + (4 + 6 + 6 * sizes.columns) * sizes.slots
+    size = passes * kept + 5 * n + sizes.laws + (4 + 6 + 6 * sizes.columns) * sizes.slots
+    return scratch_size(sizes, T) + -(-size // 4) * 4
 
 
 @functools.cache
 def adjoint(sizes: Sizes, T: type) -> wp.Kernel:
-    """Return the kernel; it launches BLOCK threads a world on CUDA, one on the CPU, in blocks of BLOCK."""
-    before = BEFORE.replace("DOF_COUNT", str(DOF_FIELDS)).replace("SLOT_COUNT", str(SLOT_FIELDS))
+    """Return the kernel; it launches WARP threads a world on CUDA, one on the CPU, in blocks of WARP."""
     passes = joint_passes.PASSES.replace(joint_passes.AFTER_A_PASS, AFTER)
-    text = native_text(before + passes + BACK + RESULTS + joint_passes.END, sizes, T, BLOCK, 0)
+    text = native_text(BEFORE + passes + BACK + RESULTS + joint_passes.END, sizes, T, WARP, 0, "work")
     return native.kernel("joint_adjoint", text, ARGUMENTS, T, shared=world_bytes(sizes, T))

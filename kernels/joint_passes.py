@@ -17,15 +17,16 @@ for (int number = 0;; ++number) {
     EACH (at, slots) {
         const int pair = slot_pair[at];
         const REAL* const value = pair_value + PV * pair;
-        const REAL kd = slot[KD * S + at], mu = value[P_FRICTION], spring = slot[PUSH * S + at];
-        const REAL depth = slot[DEPTH * S + at];
-        const REAL before[3] = {slot[U0 * S + at], slot[(U0 + 1) * S + at], slot[(U0 + 2) * S + at]};
+        const REAL kd = slot[SLOT_FIELDS * at + KD], mu = value[P_FRICTION], spring = slot[SLOT_FIELDS * at + PUSH];
+        const REAL depth = slot[SLOT_FIELDS * at + DEPTH];
+        const REAL* const was = slot + SLOT_FIELDS * at + U0;
+        const REAL before[3] = {was[0], was[1], was[2]};
         REAL u[3] = {before[0], before[1], before[2]};
         if (!first) joint_space::add_velocity(J + at * MB * 6, slot_mask + at * WORDS, dof + X * N, u);
-        const int flags = (int)slot[FLAG * S + at];
+        const int flags = (int)slot[SLOT_FIELDS * at + FLAG];
         const bool shut = flags & 1;
         const REAL push = FMA(-kd, u[0], spring), slip = sqrt(FMA(u[1], u[1], u[2] * u[2]));
-        REAL across = slot[ACROSS * S + at], w = slip;
+        REAL across = slot[SLOT_FIELDS * at + ACROSS], w = slip;
         bool candidate;
         REAL fn;
         if (first) {
@@ -42,10 +43,10 @@ for (int number = 0;; ++number) {
                 pull = -normal > pull ? -normal : pull;
                 const REAL lacks = shut || !candidate ? 0 : joint_space::positive(push);
                 missed = lacks > missed ? lacks : missed;
-                slot[F * S + at] = normal;
-                slot[(F + 1) * S + at] = -across * u[1];
-                slot[(F + 2) * S + at] = -across * u[2];
-                slot[ACROSS * S + at] = slip;
+                slot[SLOT_FIELDS * at + F] = normal;
+                slot[SLOT_FIELDS * at + F + 1] = -across * u[1];
+                slot[SLOT_FIELDS * at + F + 2] = -across * u[2];
+                slot[SLOT_FIELDS * at + ACROSS] = slip;
                 continue;
             }
         }
@@ -53,14 +54,14 @@ for (int number = 0;; ++number) {
         across = mu * fn / sqrt(FMA(w, w, value[P_EPS] * value[P_EPS]));
         const REAL rigid = (REAL)RIGID / (h * value[P_WEIGHT]);
         across = across > rigid ? rigid : across;
-        slot[ACROSS * S + at] = across;
-        slot[FLAG * S + at] = closed + 2 * candidate;
+        slot[SLOT_FIELDS * at + ACROSS] = across;
+        slot[SLOT_FIELDS * at + FLAG] = closed + 2 * candidate;
         if (closed || across > 0) joint_space::set_bits(active + at / 32, 1u << (at & 31));
-        slot[CN * S + at] = closed ? h * kd : 0;
-        slot[CT * S + at] = h * across;
-        slot[F * S + at] = closed ? h * FMA(-kd, before[0], spring) : 0;
-        slot[(F + 1) * S + at] = -h * across * before[1];
-        slot[(F + 2) * S + at] = -h * across * before[2];
+        slot[SLOT_FIELDS * at + CN] = closed ? h * kd : 0;
+        slot[SLOT_FIELDS * at + CT] = h * across;
+        slot[SLOT_FIELDS * at + F] = closed ? h * FMA(-kd, before[0], spring) : 0;
+        slot[SLOT_FIELDS * at + F + 1] = -h * across * before[1];
+        slot[SLOT_FIELDS * at + F + 2] = -h * across * before[2];
     }
     // -- laws of the dofs: drive, springs, dry friction, limits
     EACH (i, N) {
@@ -185,12 +186,12 @@ for (int number = 0;; ++number) {
                 }
                 const REAL *const one = J + at * (6 * MB) + from_j, *const other = J + at * (6 * MB) + from_i;
                 if (i == NB) {
-                    joint_space::push(one, slot + F * S + at, S, sum.x);
+                    joint_space::push(one, slot + SLOT_FIELDS * at + F, sum.x);
                     continue;
                 }
                 UNROLL
                 for (int r = 0; r < 3; ++r) {
-                    const REAL c = slot[(r ? CT : CN) * S + at];
+                    const REAL c = slot[SLOT_FIELDS * at + (r ? CT : CN)];
                     const Two a = *(const Two*)(one + 2 * r), b = *(const Two*)(other + 2 * r);
                     const REAL x = c * a.x, y = c * a.y;
                     sum.x[0] = FMA(b.x, x, sum.x[0]);
@@ -267,11 +268,11 @@ for (int number = 0;; ++number) {
         }
         if (!more) break;
         EACH (at, slots) {
-            REAL u[3] = {0, 0, 0};
+            REAL u[3] = {0, 0, 0}, *const own = slot + SLOT_FIELDS * at;
             joint_space::add_velocity(J + at * MB * 6, slot_mask + at * WORDS, dof + CHANGE * N, u);
             UNROLL
             for (int r = 0; r < 3; ++r)
-                slot[(F + r) * S + at] = FMA(-slot[(r ? CT : CN) * S + at], u[r], slot[(F + r) * S + at]);
+                own[F + r] = FMA(-own[r ? CT : CN], u[r], own[F + r]);
         }
         SYNC
         EACH (j, NB) {
@@ -282,7 +283,7 @@ for (int number = 0;; ++number) {
                 for (unsigned int left = touching[j * SLOT_WORDS + w] & active[w]; left; left &= left - 1) {
                     const int at = 32 * w + joint_space::first_of(left);
                     const int c = joint_space::rank(slot_mask + at * WORDS, j);
-                    joint_space::push(J + (at * MB + c) * 6, slot + F * S + at, S, sum);
+                    joint_space::push(J + (at * MB + c) * 6, slot + SLOT_FIELDS * at + F, sum);
                 }
             }
             A[joint_space::tile(NB, j)] = {{sum[0], sum[1], 0, 0}};
@@ -355,8 +356,8 @@ if (alive) {
             const int where = slot_of[at];
             if (table[T_PAIR + 2 * slot_pair[at] + 1] != point) continue;
             const REAL* const found = joint_space::point_of(touch, surface, where);
-            joint_space::add_force(found + 3, slot + F * S + at, S, f);
-            if (!any) slip = slot[ACROSS * S + at];
+            joint_space::add_force(found + 3, slot + SLOT_FIELDS * at + F, f);
+            if (!any) slip = slot[SLOT_FIELDS * at + ACROSS];
             gap = !any || found[9] < gap ? found[9] : gap;
             any = true;
         }
@@ -372,11 +373,11 @@ if (alive) {
         if (nears[1 + k] < 0) continue;
         REAL f[3] = {0, 0, 0}, deepest = -AWAY, slip = 0;
         for (int at = begin[k]; at < begin[k + 1]; ++at) {
-            if (slot[DEPTH * S + at] > deepest) {
-                deepest = slot[DEPTH * S + at];
-                slip = slot[ACROSS * S + at];
+            if (slot[SLOT_FIELDS * at + DEPTH] > deepest) {
+                deepest = slot[SLOT_FIELDS * at + DEPTH];
+                slip = slot[SLOT_FIELDS * at + ACROSS];
             }
-            joint_space::add_force(touch + slot_of[at] * POINT + 3, slot + F * S + at, S, f);
+            joint_space::add_force(touch + slot_of[at] * POINT + 3, slot + SLOT_FIELDS * at + F, f);
         }
         const long long row = world * contact_f.shape[1] + table[T_PAIR + 2 * nears[1 + k] + 1];
         for (int c = 0; c < 3; ++c) contact_f.data[row * 3 + c] = f[c];

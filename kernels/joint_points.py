@@ -122,13 +122,13 @@ struct joint_space
     }
 
     // Adds what a point's force does to two dofs.
-    static CUDA_CALLABLE inline void push(const REAL* J, const REAL* f, int apart, REAL* sum)
+    static CUDA_CALLABLE inline void push(const REAL* J, const REAL* f, REAL* sum)
     {
         UNROLL
         for (int r = 0; r < 3; ++r) {
             const Two one = *(const Two*)(J + 2 * r);
-            sum[0] = FMA(one.x, f[r * apart], sum[0]);
-            sum[1] = FMA(one.y, f[r * apart], sum[1]);
+            sum[0] = FMA(one.x, f[r], sum[0]);
+            sum[1] = FMA(one.y, f[r], sum[1]);
         }
     }
 
@@ -153,13 +153,13 @@ struct joint_space
     }
 
     // Adds a point's force in its axes to one in inertial axes.
-    static CUDA_CALLABLE inline void add_force(const REAL* normal, const REAL* f, int apart, REAL* to)
+    static CUDA_CALLABLE inline void add_force(const REAL* normal, const REAL* f, REAL* to)
     {
         REAL axes[9];
         for (int r = 0; r < 3; ++r) axes[r] = normal[r];
         tangents(axes, axes + 3, axes + 6);
         for (int r = 0; r < 3; ++r)
-            for (int c = 0; c < 3; ++c) to[c] = FMA(axes[3 * r + c], f[r * apart], to[c]);
+            for (int c = 0; c < 3; ++c) to[c] = FMA(axes[3 * r + c], f[r], to[c]);
     }
 
     // Two unit vectors across a normal.
@@ -189,11 +189,9 @@ alignas(64) char bytes[BYTES];
 #endif
 REAL* const s = (REAL*)bytes;
 Tile* const A = (Tile*)(s + AT_A);
-REAL *const J = s + AT_J, *const slot = s + AT_SLOT, *const dof = s + AT_DOF, *const held_mass = s + AT_M,
-    *const shares = s + AT_SHARE;
-unsigned int *const mask = (unsigned int*)(bytes + AT_MASK), *const slot_mask = (unsigned int*)(bytes + AT_SLOT_MASK);
+REAL *const dof = s + AT_DOF, *const held_mass = s + AT_M, *const shares = s + AT_SHARE;
+unsigned int* const mask = (unsigned int*)(bytes + AT_MASK);
 unsigned int *const touching = (unsigned int*)(bytes + AT_TOUCHING), *const active = (unsigned int*)(bytes + AT_ACTIVE);
-int *const slot_of = (int*)(bytes + AT_SLOT_OF), *const slot_pair = (int*)(bytes + AT_SLOT_PAIR);
 int *const keep = (int*)(bytes + AT_KEEP), *const begin = (int*)(bytes + AT_BEGIN);
 int* const start = (int*)(bytes + AT_START);
 unsigned short* const list = (unsigned short*)(bytes + AT_LIST);  // row and column of each tile, column after column
@@ -215,8 +213,9 @@ EACH (k, number_near) keep[k] = (1 << nears[1 + NEAR + k]) - 1;
 SYNC
 int total = 0;
 for (int k = 0; k < number_near; ++k) total += joint_space::count_of(keep[k]);
+const bool all_kept = total <= S - SURFACES;
 SYNC
-if (total > S - SURFACES) EACH (k, number_near) {
+if (!all_kept) EACH (k, number_near) {
     const int points = nears[1 + NEAR + k];
     int kept = keep[k];
     for (int i = 0; i < points; ++i) {
@@ -232,14 +231,19 @@ if (total > S - SURFACES) EACH (k, number_near) {
     keep[k] = kept;
 }
 SYNC
+// where few points touch, what is known of them lies in shared memory
+const int paired = all_kept ? total : S - SURFACES, slots = paired + SURFACES, rooms = slots <= ROOM ? ROOM : S;
+REAL *const J = slots <= ROOM ? s + AT_SLOTS : SCRATCH, *const slot = J + 6 * MB * rooms;
+int *const slot_of = (int*)(slot + SLOT_FIELDS * rooms), *const slot_pair = slot_of + rooms;
+unsigned int* const slot_mask = (unsigned int*)(slot_pair + rooms);
 if (lane == 0) {
-    int slots = 0;
+    int at = 0;
     for (int k = 0; k < number_near; ++k) {
-        begin[k] = slots;
-        for (unsigned int left = keep[k]; left; left &= left - 1)
-            slot_of[slots++] = k * MOST + joint_space::first_of(left);
+        begin[k] = at;
+        for (unsigned int left = keep[k]; left && at < paired; left &= left - 1)
+            slot_of[at++] = k * MOST + joint_space::first_of(left);
     }
-    begin[number_near] = slots;
+    begin[number_near] = at;
 }
 // -- what dofs move; then velocities and loads
 EACH (i, SCREW * DOFS) s[AT_A + i] = screws.data[world * (SCREW * DOFS) + i];
@@ -252,7 +256,6 @@ EACH (i, N) {
 EACH (i, 4 * HELD) held_mass[i] = 0;
 SYNC
 EACH (e, NNZ) held_mass[table[T_ENTRY + e]] = mass.data[world * NNZ + e];
-const int paired = begin[number_near], slots = paired + SURFACES;
 EACH (at, slots) {
     const int where = at < paired ? slot_of[at] : NEAR * MOST + at - paired, pair = joint_space::pair_of(nears, where);
     if (at >= paired) slot_of[at] = where;
@@ -338,17 +341,17 @@ EACH (at, slots) {
     const REAL *const value = pair_value + PV * pair, *const found = joint_space::point_of(touch, surface, where);
     REAL u[3] = {0, 0, 0};
     joint_space::add_velocity(J + at * MB * 6, slot_mask + at * WORDS, dof + V0 * N, u);
-    for (int r = 0; r < 3; ++r) slot[(U0 + r) * S + at] = u[r];
-    slot[DEPTH * S + at] = found[6];
+    for (int r = 0; r < 3; ++r) slot[SLOT_FIELDS * at + U0 + r] = u[r];
+    slot[SLOT_FIELDS * at + DEPTH] = found[6];
     if (pair < PAIRS) {  // a pair's law is shared by its points
         const REAL share = (REAL)1 / nears[1 + NEAR + where / MOST], k = value[P_STIFFNESS] * share;
-        slot[PUSH * S + at] = k * found[6];
-        slot[KD * S + at] = FMA(k, h, value[P_DAMPING] * share);
+        slot[SLOT_FIELDS * at + PUSH] = k * found[6];
+        slot[SLOT_FIELDS * at + KD] = FMA(k, h, value[P_DAMPING] * share);
     } else {
-        slot[PUSH * S + at] = found[7];
-        slot[KD * S + at] = FMA(value[P_STIFFNESS], h, found[8]);
+        slot[SLOT_FIELDS * at + PUSH] = found[7];
+        slot[SLOT_FIELDS * at + KD] = FMA(value[P_STIFFNESS], h, found[8]);
     }
-    slot[FLAG * S + at] = slot[ACROSS * S + at] = 0;
+    slot[SLOT_FIELDS * at + FLAG] = slot[SLOT_FIELDS * at + ACROSS] = 0;
 }
 REAL cone = 0, pull = 0, effort_excess = 0, missed = 0;
 bool floored = false;

@@ -204,9 +204,9 @@ class Run:
 def compile_solvers(runs: list[Run], variants: list[tuple[int, int, int | None]], device: wp.Device) -> float:
     """Compile the solvers side by side; return the seconds that it took."""
     start = time.perf_counter()
-    modules = {run.solver(*each).solver.module for run in runs for each in variants}
+    solvers = {one.solver: one.block for one in (run.solver(*each) for run in runs for each in variants)}
     with ThreadPoolExecutor() as pool:
-        list(pool.map(lambda module: module.load(device, block_dim=joint_space.BLOCK), modules))
+        list(pool.map(lambda kernel: kernel.module.load(device, block_dim=solvers[kernel]), solvers))
     return time.perf_counter() - start
 
 
