@@ -26,7 +26,6 @@ from .joint_space import (
     WARP,
     Sizes,
     native_text,
-    scratch_size,
     world_bytes,
 )
 
@@ -46,7 +45,7 @@ of contacts [world, contact] they are whole for pairs, and lack what push and da
 
 BEFORE = r"""
 enum { K_DOF = 4 * TILES, K_SLOT = K_DOF + DOF_FIELDS * N, K_SHARE = K_SLOT + SLOT_FIELDS * S, KEPT = K_SHARE + LAWS };
-REAL* const history = work.data + world * work.shape[1] + KEPT_SLOTS;
+REAL* const history = work.data + world * work.shape[1];
 """
 AFTER = r"""
     EACH (i, K_DOF) history[(long long)number * KEPT + i] = s[AT_A + i];
@@ -429,17 +428,17 @@ EACH (own, DOFS) {
 """
 
 
-def work_size(sizes: Sizes, T: type, passes: int) -> int:
+def work_size(sizes: Sizes, passes: int) -> int:
     """Return how many scalars of memory a world takes for so many passes, a multiple of four."""
     n, tiles = 2 * sizes.tiles, sizes.tiles * (sizes.tiles + 1) // 2 + sizes.tiles
     kept = 4 * tiles + DOF_FIELDS * n + SLOT_FIELDS * sizes.slots + sizes.laws
     size = passes * kept + 5 * n + sizes.laws + (4 + 6 + 6 * sizes.columns) * sizes.slots
-    return scratch_size(sizes, T) + -(-size // 4) * 4
+    return -(-size // 4) * 4
 
 
 @functools.cache
 def adjoint(sizes: Sizes, T: type) -> wp.Kernel:
     """Return the kernel; it launches WARP threads a world on CUDA, one on the CPU, in blocks of WARP."""
     passes = joint_passes.PASSES.replace(joint_passes.AFTER_A_PASS, AFTER)
-    text = native_text(BEFORE + passes + BACK + RESULTS + joint_passes.END, sizes, T, WARP, 0, "work")
+    text = native_text(BEFORE + passes + BACK + RESULTS + joint_passes.END, sizes, T, WARP, 0)
     return native.kernel("joint_adjoint", text, ARGUMENTS, T, shared=world_bytes(sizes, T))

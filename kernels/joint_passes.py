@@ -6,8 +6,9 @@ It continues the text of :mod:`.joint_points`.
 AFTER_A_PASS = "    // -- after a pass\n"
 """Line of PASSES where the unknown of a pass, its laws and its factors are known."""
 PASSES = r"""
-int lane_a, lane_b;
+int lane_a, lane_b, next_a, next_b;  // of the first two rounds of products of a column
 joint_space::corner(lane, lane_a, lane_b);
+joint_space::corner(lane + LANES, next_a, next_b);
 LOOP
 for (int number = 0;; ++number) {
     const bool first = number == 0, last = number == pass_count - 1 && pass_count >= 3, done = number == pass_count;
@@ -205,22 +206,16 @@ for (int number = 0;; ++number) {
     }
     SYNC
     // -- factors, a column of tiles after the other; the right side is the last row
-    floored = false;
     LOOP
-    for (int j = 0; j < NB; ++j) {
-        const unsigned short* const rows = list + start[j] + 1;
-        const int below = start[j + 1] - start[j] - 1;
+    for (int j = 0, from = 0, next; j < NB; ++j, from = next) {
+        next = start[j + 1];
+        const unsigned short* const rows = list + from + 1;
+        const int below = next - from - 1, products = below * (below + 1) / 2 - 1;
         const Pivot p = joint_space::pivot(A[joint_space::tile(j, j)], dof + CHANGE * N + 2 * j);
-        floored |= p.low;
-        if (lane == 0) {
-            dof[I0 * N + j] = p.i0;
-            dof[L10 * N + j] = p.l;
-            dof[I1 * N + j] = p.i1;
-        }
+        int a = lane_a, b = lane_b;
         LOOP
-        for (int t = lane; t < below * (below + 1) / 2 - 1; t += LANES) {
-            int a = lane_a, b = lane_b;
-            if (t >= LANES) joint_space::corner(t, a, b);
+        for (int t = lane; t < products; t += LANES) {
+            if (t >= 2 * LANES) joint_space::corner(t, a, b);
             const int i = rows[a] >> 8, k = rows[b] >> 8;
             const Tile x = A[joint_space::tile(i, j)];
             Tile y = A[joint_space::tile(k, j)];
@@ -233,29 +228,55 @@ for (int number = 0;; ++number) {
                 z.x[2 + c] = FMA(-x.x[3], y.x[2 * c + 1], FMA(-x.x[2], y.x[2 * c], z.x[2 + c]));
             }
             to = z;
+            a = next_a;
+            b = next_b;
         }
         SYNC
     }
+    floored = false;
+    EACH (j, NB) {
+        const Pivot p = joint_space::pivot(A[joint_space::tile(j, j)], dof + CHANGE * N + 2 * j);
+        floored |= p.low;
+        dof[I0 * N + j] = p.i0;
+        dof[L10 * N + j] = p.l;
+        dof[I1 * N + j] = p.i1;
+    }
+    SYNC
     // -- back substitution, and in the last pass a step of refinement with the same factors
     LOOP
     for (int refined = 0;; ++refined) {
+        // a lane has the right side of its blocks; what is not listed of a row is zero
+        REAL own[EACH_LANE][2];
+        EACH_OWN (p) {
+            const int k = lane + p * LANES;
+            const Tile& y = A[joint_space::tile(NB, k < NB ? k : 0)];
+            own[p][0] = y.x[0];
+            own[p][1] = y.x[1];
+        }
         LOOP
         for (int j = NB - 1; j >= 0; --j) {
-            const Tile& y = A[joint_space::tile(NB, j)];
-            REAL x0 = y.x[0], x1 = y.x[1];
+            REAL x0, x1;
+            joint_space::share_two(own, j, x0, x1);
             joint_space::divide(dof[I0 * N + j], dof[L10 * N + j], dof[I1 * N + j], x0, x1);
-            if (lane == 0) {
-                dof[CHANGE * N + 2 * j] = x0;
-                dof[CHANGE * N + 2 * j + 1] = x1;
-            }
-            EACH (k, j) {
+            EACH_OWN (p) {
+                const int k = lane + p * LANES;
+                if (k == j) {
+                    own[p][0] = x0;
+                    own[p][1] = x1;
+                }
+                if (k >= j) continue;
                 const Tile x = A[joint_space::tile(j, k)];
-                Tile& to = A[joint_space::tile(NB, k)];
-                to.x[0] = FMA(-x.x[2], x1, FMA(-x.x[0], x0, to.x[0]));
-                to.x[1] = FMA(-x.x[3], x1, FMA(-x.x[1], x0, to.x[1]));
+                own[p][0] = FMA(-x.x[2], x1, FMA(-x.x[0], x0, own[p][0]));
+                own[p][1] = FMA(-x.x[3], x1, FMA(-x.x[1], x0, own[p][1]));
             }
-            SYNC
         }
+        EACH_OWN (p) {
+            const int k = lane + p * LANES;
+            if (k >= NB) continue;
+            dof[CHANGE * N + 2 * k] = own[p][0];
+            dof[CHANGE * N + 2 * k + 1] = own[p][1];
+        }
+        SYNC
         const bool more = number == pass_count - 1 && refined < REFINE;
         EACH (i, N) {
             const REAL x = dof[CHANGE * N + i];
@@ -268,11 +289,11 @@ for (int number = 0;; ++number) {
         }
         if (!more) break;
         EACH (at, slots) {
-            REAL u[3] = {0, 0, 0}, *const own = slot + SLOT_FIELDS * at;
+            REAL u[3] = {0, 0, 0}, *const load = slot + SLOT_FIELDS * at;
             joint_space::add_velocity(J + at * MB * 6, slot_mask + at * WORDS, dof + CHANGE * N, u);
             UNROLL
             for (int r = 0; r < 3; ++r)
-                own[F + r] = FMA(-own[r ? CT : CN], u[r], own[F + r]);
+                load[F + r] = FMA(-load[r ? CT : CN], u[r], load[F + r]);
         }
         SYNC
         EACH (j, NB) {
@@ -289,21 +310,30 @@ for (int number = 0;; ++number) {
             A[joint_space::tile(NB, j)] = {{sum[0], sum[1], 0, 0}};
         }
         SYNC
-        LOOP
-        for (int j = 0; j < NB; ++j) {
-            const unsigned short* const rows = list + start[j] + 1;
-            const Tile& own = A[joint_space::tile(NB, j)];
-            REAL y0 = own.x[0], y1 = own.x[1];
-            joint_space::divide(dof[I0 * N + j], dof[L10 * N + j], dof[I1 * N + j], y0, y1);
-            EACH (a, start[j + 1] - start[j] - 2) {
-                const int i = rows[a] >> 8;
-                const Tile x = A[joint_space::tile(i, j)];
-                Tile& to = A[joint_space::tile(NB, i)];
-                to.x[0] = FMA(-x.x[1], y1, FMA(-x.x[0], y0, to.x[0]));
-                to.x[1] = FMA(-x.x[3], y1, FMA(-x.x[2], y0, to.x[1]));
-            }
-            SYNC
+        EACH_OWN (p) {
+            const int k = lane + p * LANES;
+            const Tile& y = A[joint_space::tile(NB, k < NB ? k : 0)];
+            own[p][0] = y.x[0];
+            own[p][1] = y.x[1];
         }
+        LOOP
+        for (int j = 0; j < NB - 1; ++j) {
+            REAL y0, y1;
+            joint_space::share_two(own, j, y0, y1);
+            joint_space::divide(dof[I0 * N + j], dof[L10 * N + j], dof[I1 * N + j], y0, y1);
+            EACH_OWN (p) {
+                const int k = lane + p * LANES;
+                if (k <= j || k >= NB) continue;
+                const Tile x = A[joint_space::tile(k, j)];
+                own[p][0] = FMA(-x.x[1], y1, FMA(-x.x[0], y0, own[p][0]));
+                own[p][1] = FMA(-x.x[3], y1, FMA(-x.x[2], y0, own[p][1]));
+            }
+        }
+        EACH_OWN (p) {
+            const int k = lane + p * LANES;
+            if (k < NB) A[joint_space::tile(NB, k)] = {{own[p][0], own[p][1], 0, 0}};
+        }
+        SYNC
     }
     SYNC
     // -- after a pass
@@ -402,5 +432,8 @@ if (alive) {
 """
 END = r"""#undef LANES
 #undef SYNC
+#undef ANY
 #undef EACH
+#undef EACH_LANE
+#undef EACH_OWN
 """

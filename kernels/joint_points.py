@@ -5,10 +5,15 @@ enum { CONSTANTS };
 #if defined(__CUDA_ARCH__)
 #define LANES LANE_COUNT
 #define SYNC __syncwarp();
+#define EACH_OWN(p) _Pragma("unroll") for (int p = 0; p < EACH_LANE; ++p)
+#define ANY(x) __any_sync(0xffffffffu, x)
 #else
 #define LANES 1
 #define SYNC
+#define EACH_OWN(p) for (int p = 0; p < EACH_LANE; ++p)
+#define ANY(x) (x)
 #endif
+#define EACH_LANE ((NB + LANES - 1) / LANES)
 #define EACH(i, n) for (int i = lane; i < (n); i += LANES)
 struct alignas(16) Tile { REAL x[4]; };  // rows of a 2 x 2 block
 struct alignas(2 * sizeof(REAL)) Two { REAL x, y; };
@@ -17,10 +22,31 @@ struct joint_space
 {
     static CUDA_CALLABLE inline REAL inverse(REAL x)
     {
+        REAL y;
 #if defined(__CUDA_ARCH__)
-        return QUOTIENT(1, x);
+        INVERSE
 #else
-        return 1 / x;
+        y = 1 / x;
+#endif
+        return y;
+    }
+
+    // Of values that lanes have, an entry for each of their blocks, two of block j: on all lanes.
+    static CUDA_CALLABLE inline void share_two(const REAL values[][2], int j, REAL& x0, REAL& x1)
+    {
+#if defined(__CUDA_ARCH__)
+        x0 = values[0][0];
+        x1 = values[0][1];
+        UNROLL
+        for (int p = 1; p < EACH_LANE; ++p) {
+            x0 = j / LANES == p ? values[p][0] : x0;
+            x1 = j / LANES == p ? values[p][1] : x1;
+        }
+        x0 = __shfl_sync(0xffffffffu, x0, j % LANES, LANES);
+        x1 = __shfl_sync(0xffffffffu, x1, j % LANES, LANES);
+#else
+        x0 = values[j][0];
+        x1 = values[j][1];
 #endif
     }
 
@@ -28,10 +54,9 @@ struct joint_space
     static CUDA_CALLABLE inline Pivot pivot(const Tile& diagonal, const REAL* least)
     {
         const REAL d0 = diagonal.x[0];
-        const bool low = d0 < least[0];
-        const REAL i0 = inverse(low ? least[0] : d0), l = diagonal.x[2] * i0;
+        const REAL i0 = inverse(d0 < least[0] ? least[0] : d0), l = diagonal.x[2] * i0;
         const REAL d1 = FMA(-l, diagonal.x[2], diagonal.x[3]);
-        return {i0, l, inverse(d1 < least[1] ? least[1] : d1), low || d1 < least[1]};
+        return {i0, l, inverse(d1 < least[1] ? least[1] : d1), d0 < least[0] || d1 < least[1]};
     }
 
     // Replaces two entries by those times the inverse of a diagonal tile.
@@ -179,8 +204,7 @@ struct joint_space
 POINTS = r"""
 const int lane = (int)(thread % LANES);
 const long long number_of_world = thread / LANES;
-const bool alive = number_of_world < worlds;
-const long long world = alive ? number_of_world : worlds - 1;
+const long long world = number_of_world < worlds ? number_of_world : worlds - 1;
 #if defined(__CUDA_ARCH__)
 extern __shared__ char dynamic_smem_base[];
 char* const bytes = dynamic_smem_base + (threadIdx.x / LANES) * BYTES;
@@ -189,9 +213,11 @@ alignas(64) char bytes[BYTES];
 #endif
 REAL* const s = (REAL*)bytes;
 Tile* const A = (Tile*)(s + AT_A);
-REAL *const dof = s + AT_DOF, *const held_mass = s + AT_M, *const shares = s + AT_SHARE;
-unsigned int* const mask = (unsigned int*)(bytes + AT_MASK);
+REAL *const J = s + AT_J, *const slot = s + AT_SLOT, *const dof = s + AT_DOF, *const held_mass = s + AT_M,
+    *const shares = s + AT_SHARE;
+unsigned int *const mask = (unsigned int*)(bytes + AT_MASK), *const slot_mask = (unsigned int*)(bytes + AT_SLOT_MASK);
 unsigned int *const touching = (unsigned int*)(bytes + AT_TOUCHING), *const active = (unsigned int*)(bytes + AT_ACTIVE);
+int *const slot_of = (int*)(bytes + AT_SLOT_OF), *const slot_pair = (int*)(bytes + AT_SLOT_PAIR);
 int *const keep = (int*)(bytes + AT_KEEP), *const begin = (int*)(bytes + AT_BEGIN);
 int* const start = (int*)(bytes + AT_START);
 unsigned short* const list = (unsigned short*)(bytes + AT_LIST);  // row and column of each tile, column after column
@@ -205,14 +231,16 @@ const REAL* const motor = motors.data + world * motors.shape[1];
 const REAL* const dof_value = dof_values.data + (dof_values.shape[0] > 1 ? world : 0) * dof_values.shape[1];
 const REAL* const pair_value = pair_values.data + (pair_values.shape[0] > 1 ? world : 0) * pair_values.shape[1];
 const REAL half_gravity = pair_value[PV * (PAIRS + SURFACES)];
-const int number_near = nears[0] < NEAR ? nears[0] : NEAR;
-const int pass_count = (int)passes;
+const int listed = nears[0] < NEAR ? nears[0] : NEAR, pass_count = (int)passes;
+int total = 0;
+for (int k = 0; k < listed; ++k) total += nears[1 + NEAR + k];
+const bool alive = number_of_world < worlds && total + SURFACES > LEAST && !(LEAVES && total + SURFACES > S);
+if (!ANY(alive)) return;
+const int number_near = alive ? listed : 0;
+total = alive ? total : 0;
 
 // -- slots: all points with the ground, and those of the near pairs, or of these the deepest where slots are too few
 EACH (k, number_near) keep[k] = (1 << nears[1 + NEAR + k]) - 1;
-SYNC
-int total = 0;
-for (int k = 0; k < number_near; ++k) total += joint_space::count_of(keep[k]);
 const bool all_kept = total <= S - SURFACES;
 SYNC
 if (!all_kept) EACH (k, number_near) {
@@ -231,11 +259,7 @@ if (!all_kept) EACH (k, number_near) {
     keep[k] = kept;
 }
 SYNC
-// where few points touch, what is known of them lies in shared memory
-const int paired = all_kept ? total : S - SURFACES, slots = paired + SURFACES, rooms = slots <= ROOM ? ROOM : S;
-REAL *const J = slots <= ROOM ? s + AT_SLOTS : SCRATCH, *const slot = J + 6 * MB * rooms;
-int *const slot_of = (int*)(slot + SLOT_FIELDS * rooms), *const slot_pair = slot_of + rooms;
-unsigned int* const slot_mask = (unsigned int*)(slot_pair + rooms);
+const int paired = all_kept ? total : S - SURFACES, slots = paired + SURFACES;
 if (lane == 0) {
     int at = 0;
     for (int k = 0; k < number_near; ++k) {

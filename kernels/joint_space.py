@@ -52,7 +52,7 @@ NUMBERS = ("h", "passes", "most_force", "most_effort")
 ARGUMENTS = [
     ("mass", 2), ("bias", 2), ("tau", 2), ("q", 2), ("qd", 2), ("target_q", 2), ("target_qd", 2), ("screws", 2),
     ("near", 1), ("touches", 2), ("surfaces", 2), ("motors", 2), ("dof_values", 2), ("pair_values", 2), ("place", 1),
-    *((name, 0) for name in NUMBERS), ("scratch", 2),
+    *((name, 0) for name in NUMBERS),
     ("out", 2), ("qdd", 2), ("contact_f", 3), ("contact_gap", 2), ("contact_slip", 2), ("excess", 2), ("status", 1),
 ]  # fmt: skip
 """Names and numbers of axes.
@@ -75,7 +75,8 @@ class Sizes(NamedTuple):
         surfaces, points: surfaces of the ground at points, each of which has a slot; points with the ground.
         laws: of motors and of springs, beside those that follow from constants of a dof.
         held: tiles of the mass matrix that are not zero.
-        room: slots in shared memory; worlds in which more points touch have theirs in global memory.
+        least: worlds that need at most so many slots are left to another kernel. leaves: so are those that need more
+            than there are.
     """
 
     dofs: int
@@ -90,7 +91,8 @@ class Sizes(NamedTuple):
     points: int = 0
     laws: int = 0
     held: int = 0
-    room: int = 0
+    least: int = -1
+    leaves: bool = False
 
     @property
     def words(self) -> int:
@@ -118,23 +120,14 @@ class Sizes(NamedTuple):
         return starts | {"END": at}
 
 
-def slot_size(sizes: Sizes, T: type) -> int:
-    """Return how many scalars of memory a slot takes."""
-    return 6 * sizes.columns + SLOT_FIELDS + -(-(2 + sizes.words) * 4 // (4 if T is wp.float32 else 8))
-
-
-def scratch_size(sizes: Sizes, T: type) -> int:
-    """Return how many scalars of global memory a world may need for its slots, a multiple of four."""
-    return -(-slot_size(sizes, T) * sizes.slots // 4) * 4 if sizes.room < sizes.slots else 0
-
-
 def shared_layout(sizes: Sizes, T: type) -> tuple[dict[str, int], int]:
     """Return where arrays of a world begin in shared memory, in scalars and then in bytes, and its bytes."""
     b, real = sizes.tiles, 4 if T is wp.float32 else 8
     starts, at = {}, 0
     reals = {
         "AT_A": max(4 * (b * (b + 1) // 2 + b), SCREW * sizes.dofs, 5 * WARP),
-        "AT_SLOTS": slot_size(sizes, T) * sizes.room, "AT_DOF": DOF_FIELDS * 2 * b, "AT_M": 4 * sizes.held,
+        "AT_J": 6 * sizes.columns * sizes.slots, "AT_SLOT": SLOT_FIELDS * sizes.slots, "AT_DOF": DOF_FIELDS * 2 * b,
+        "AT_M": 4 * sizes.held,
         "AT_SHARE": sizes.laws,
     }  # fmt: skip
     for name, size in reals.items():
@@ -142,6 +135,7 @@ def shared_layout(sizes: Sizes, T: type) -> tuple[dict[str, int], int]:
     at *= real
     parts = {
         "AT_MASK": 4 * b * sizes.words, "AT_TOUCHING": 4 * b * sizes.slot_words, "AT_ACTIVE": 4 * sizes.slot_words,
+        "AT_SLOT_OF": 4 * sizes.slots, "AT_SLOT_PAIR": 4 * sizes.slots, "AT_SLOT_MASK": 4 * sizes.slots * sizes.words,
         "AT_KEEP": 4 * sizes.near, "AT_BEGIN": 4 * (sizes.near + 1), "AT_START": 4 * (b + 1), "AT_LIST": b * (b + 3),
     }  # fmt: skip
     for name, size in parts.items():
@@ -166,7 +160,6 @@ def solver(sizes: Sizes, T: type, lanes: int = 32, registers: int | None = None,
     ``refine``: steps of iterative refinement in the last pass.
 
     It launches ``lanes * worlds`` threads on CUDA, ``worlds`` on the CPU, in blocks of :func:`threads_of_block`.
-    ``scratch`` [world, :func:`scratch_size`] is memory of worlds that need more slots than ``sizes.room``.
     """
     passes = joint_passes.PASSES.replace(joint_passes.AFTER_A_PASS, "")
     text = native_text(passes + joint_passes.RESULTS + joint_passes.END, sizes, T, lanes, refine)
@@ -174,7 +167,7 @@ def solver(sizes: Sizes, T: type, lanes: int = 32, registers: int | None = None,
     return native.kernel("joint_space", text, ARGUMENTS, T, registers=registers, shared=shared)
 
 
-def native_text(text: str, sizes: Sizes, T: type, lanes: int, refine: int, scratch: str = "scratch") -> str:
+def native_text(text: str, sizes: Sizes, T: type, lanes: int, refine: int) -> str:
     """Return the native text of a kernel that goes on with ``text`` where points have slots and Jacobians."""
     starts, size = shared_layout(sizes, T)
     constants = {
@@ -183,7 +176,7 @@ def native_text(text: str, sizes: Sizes, T: type, lanes: int, refine: int, scrat
         "DV": len(DOF_VALUES), "PV": len(PAIR_VALUES), "TILES": sizes.tiles * (sizes.tiles + 1) // 2 + sizes.tiles,
         "REFINE": refine, "SURFACE": SURFACE, "SURFACES": sizes.surfaces, "CONTACT_POINTS": sizes.points,
         "WORDS": sizes.words, "SLOT_WORDS": sizes.slot_words, "HELD": sizes.held,
-        "ROOM": sizes.room, "KEPT_SLOTS": scratch_size(sizes, T),
+        "LEAST": sizes.least, "LEAVES": int(sizes.leaves),
         "DOF_FIELDS": DOF_FIELDS, "SLOT_FIELDS": SLOT_FIELDS,
         "LAW": LAW, "LAWS": sizes.laws, "SCREW": SCREW,
     }  # fmt: skip
@@ -197,11 +190,11 @@ def native_text(text: str, sizes: Sizes, T: type, lanes: int, refine: int, scrat
     text = text.replace("UNROLL\n", "#pragma unroll\n").replace("LOOP\n", "#pragma unroll 1\n")
     text = (
         text.replace("AWAY", "(REAL)INFINITY")
-        .replace("SCRATCH", f"{scratch}.data + world * {scratch}.shape[1]")
         .replace("(REAL)RIGID", f"(REAL){RIGID[T]:g}")
         .replace("(REAL)FLOOR", f"(REAL){FLOOR[T]:g}")
         .replace("LANE_COUNT", str(lanes))
         .replace("REAL", c)
         .replace("FMA(", f"FUSED_{c}(")
     )
-    return FUSED + text.replace("QUOTIENT(", "__fdividef(" if T is wp.float32 else "__ddiv_rn(")
+    inverse = 'asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));' if T is wp.float32 else "y = 1 / x;"
+    return FUSED + text.replace("INVERSE\n", f"{inverse}\n")

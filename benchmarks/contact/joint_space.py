@@ -204,9 +204,9 @@ class Run:
 def compile_solvers(runs: list[Run], variants: list[tuple[int, int, int | None]], device: wp.Device) -> float:
     """Compile the solvers side by side; return the seconds that it took."""
     start = time.perf_counter()
-    solvers = {one.solver: one.block for one in (run.solver(*each) for run in runs for each in variants)}
+    solvers = {part for run in runs for each in variants for part in run.solver(*each).solvers}
     with ThreadPoolExecutor() as pool:
-        list(pool.map(lambda kernel: kernel.module.load(device, block_dim=solvers[kernel]), solvers))
+        list(pool.map(lambda part: part[0].module.load(device, block_dim=part[2]), solvers))
     return time.perf_counter() - start
 
 

@@ -175,19 +175,20 @@ def _bodies(scene: Scene, pair: int) -> tuple[int, int]:
 def _order(scene: Scene, dofs_of: list[np.ndarray], ways: list[list[int]]) -> list[int]:
     """Return dofs in the order of elimination, each limb from an even place on; -1 fills.
 
-    Trees that touch many others come last, and children before what carries them, so that limbs fill nothing.
+    Trees that may touch others in many ways come last, and children before what carries them, so that limbs fill
+    nothing.
     """
     trees: dict[int, list[int]] = {}
     for body, way in enumerate(ways):
         trees.setdefault(way[-1], []).append(body)
-    met: dict[int, set[int]] = {root: set() for root in trees}
+    met = dict.fromkeys(trees, 0)
     for pair in scene.contact_pairs:
-        roots = [ways[body][-1] for body in (pair.body, pair.other) if body >= 0]
-        for root in roots:
-            met[root] |= set(roots) - {root}
+        roots = {ways[body][-1] for body in (pair.body, pair.other) if body >= 0}
+        for root in roots if len(roots) > 1 else ():
+            met[root] += 1
     order: list[int] = []
     sizes = {root: sum(len(dofs_of[body]) for body in bodies) for root, bodies in trees.items()}
-    for root in sorted(trees, key=lambda root: (len(met[root]), -sizes[root], root)):
+    for root in sorted(trees, key=lambda root: (met[root], -sizes[root], root)):
         children: dict[int, list[int]] = {body: [] for body in trees[root]}
         for body in trees[root]:
             if body != root:

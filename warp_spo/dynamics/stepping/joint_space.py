@@ -37,9 +37,11 @@ NO_ROOM = "more dofs and contacts than the shared memory of the GPU holds of a w
 NO_ROOM_WAY = "use dtype='float32', or list fewer pairs"
 NEAR, NEAR_A_BODY = 256, 4
 """Pairs that may be near in a world: so many, or so many for each body of a pair. One takes 240 bytes in float32."""
-FULL, A_TREE = 8, 4
+FULL, LEAST, LEAST_A_BODY, A_TREE = 8, 16, 2, 4
 """Of FULL pairs, or of as many as there are bodies of a pair, all points have slots. In a pile a body lies on one or
-two others, mostly with four points; shared memory has room for A_TREE points of each tree of bodies."""
+two others, mostly with four points. Where shared memory is short, LEAST slots, or LEAST_A_BODY for each body, stay.
+On a GPU worlds with up to A_TREE points for each tree of bodies have a kernel with no more slots, of which many run
+at once."""
 
 
 def is_generated(dyn: Dynamics) -> bool:
@@ -113,7 +115,7 @@ class JointSpaceStep:
         registers: of a thread at most; None: as the compiler chooses.
         margin: how near shapes must be to be looked at where nothing moves [m].
         refine: steps of iterative refinement in the last pass; None: one in float32.
-        room: slots of pairs in shared memory; None: A_TREE for each tree of bodies. Worlds that need more are slower.
+        few: points of pairs up to which a world has a kernel with no more slots; None: as A_TREE says.
     """
 
     def __init__(
@@ -125,7 +127,7 @@ class JointSpaceStep:
         registers: int | None = None,
         margin: float = MARGIN,
         refine: int | None = None,
-        room: int | None = None,
+        few: int | None = None,
     ):
         scene: Scene = dyn.scene
         T: Any = dyn.dtype
@@ -139,13 +141,16 @@ class JointSpaceStep:
         self.motor_laws = motors = motor_laws(scene, dyn.variable)
         tables = joint_tables(scene, pattern, near, slots, surfaces, motors, [_routine(*x.shapes) for x in pairs])
         sizes = tables.sizes
-        room = slots if room is None and not self.device.is_cuda else room
-        room = A_TREE * sum(parent < 0 for parent in scene.tree.parent) if room is None else room
-        sizes = sizes._replace(room=min(slots, room) + sizes.surfaces)
-        while sizes.room > 0 and joint_space.world_bytes(sizes, T) > ROOM and self.device.is_cuda:
-            sizes = sizes._replace(room=max(0, sizes.room - 8))
+        least = min(slots, max(LEAST, LEAST_A_BODY * len(scene.bodies)))
+        while self.device.is_cuda and slots > least and joint_space.world_bytes(sizes, T) > ROOM:
+            self.slot_count = slots = max(least, slots - 8)
+            sizes = sizes._replace(slots=slots + sizes.surfaces)
+        if few is None:
+            few = A_TREE * sum(parent < 0 for parent in scene.tree.parent) if self.device.is_cuda else slots
+        few = min(few, slots) + sizes.surfaces
+        parts = [sizes._replace(slots=few, leaves=True), sizes._replace(least=few)] if few < sizes.slots else [sizes]
         self.tables = tables = tables._replace(sizes=sizes)
-        crowded = 2 * joint_space.world_bytes(sizes, T) > MOST_SHARED
+        crowded = 2 * joint_space.world_bytes(parts[0], T) > MOST_SHARED
         narrow = scene.dof_count <= NARROW and not crowded
         self.lanes = lanes or (32 if crowded or (dyn.worlds <= FEW and not narrow) else 16)
         array: Any = functools.partial(wp.array, dtype=T, device=self.device)
@@ -168,7 +173,6 @@ class JointSpaceStep:
         self.velocities = make(self.worlds, scene.body_count, 6)
         self.bias, self.still = make(self.worlds, n), make(self.worlds, n)
         self.qd_out, self.qdd, self.excess = make(self.worlds, n), make(self.worlds, n), make(self.worlds, 3)
-        self.scratch = make(self.worlds, max(1, joint_space.scratch_size(sizes, T)))
         self.contact_f, self.status = make(self.worlds, contacts, 3), make(self.worlds, dtype=int)
         self.contact_gap, self.contact_slip = make(self.worlds, contacts), make(self.worlds, contacts)
         gravity = float(np.linalg.norm(scene.values["gravity"], axis=1).max())
@@ -177,10 +181,11 @@ class JointSpaceStep:
         weight = float(scene.values["body_mass"].sum(axis=1).max()) * 9.81
         effort = float(efforts[efforts > 0.0].min()) if (efforts > 0.0).any() else 1.0
         self.tolerances = [TOLERANCE * weight, TOLERANCE * effort]
-        self.solver = joint_space.solver(
-            sizes, T, self.lanes, registers, int(T is wp.float32) if refine is None else refine
-        )
-        self.block = joint_space.threads_of_block(sizes, T, self.lanes)
+        self.solvers = []
+        for part, threads in zip(parts, (self.lanes, 32), strict=False):
+            refined = int(T is wp.float32) if refine is None else refine
+            kernel = joint_space.solver(part, T, threads, registers, refined)
+            self.solvers.append((kernel, threads, joint_space.threads_of_block(part, T, threads)))
         self._make_shapes(array)
         self.broad = near_pairs.broad(sizes.pairs, near, T)
 
@@ -257,9 +262,10 @@ class JointSpaceStep:
         system += [self.motors, self.dof_values, self.pair_values, self.place]
         names = "qd_out", "qdd", "contact_f", "contact_gap", "contact_slip", "excess", "status"
         out = [(results or {}).get(name, getattr(self, name)) for name in names]
-        a_world = self.lanes if self.device.is_cuda else 1
-        numbers = [dt, float(passes), *self.tolerances, self.scratch]
-        self._launch(self.solver, a_world * self.worlds, system + numbers, out, self.block)
+        numbers = [dt, float(passes), *self.tolerances]
+        for kernel, lanes, block in self.solvers:
+            a_world = lanes if self.device.is_cuda else 1
+            self._launch(kernel, a_world * self.worlds, system + numbers, out, block)
 
     def find_system(self, q: wp.array, qd: wp.array, dt: float, **acting: wp.array | None) -> None:
         """Compute mass, poses, velocities, bias, surfaces, and what varies between worlds, of a state.

@@ -130,7 +130,7 @@ class JointSpaceGradients:
         tau, target_q, target_qd = (given.get(name, other) for name, other in optional.items())
         read = [solver.mass, solver.bias, tau, given["q"], given["qd"], target_q, target_qd, solver.screws, solver.near]
         read += [solver.touches, solver.surfaces, solver.motors, solver.dof_values, solver.pair_values, solver.place]
-        size = joint_adjoint.work_size(sizes, self.solver.dyn.dtype, count)
+        size = joint_adjoint.work_size(sizes, count)
         work = self._array("passes", count, (self.worlds, size))
         solved, gains = (self._array(name, count, (self.worlds, count * dofs)) for name in ("solved", "gains"))
         shapes = {"tau": tau, "q": given["q"], "qd": given["qd"], "target_q": target_q, "target_qd": target_qd}
