@@ -247,7 +247,8 @@ for (int number = 0;; ++number) {
     for (int refined = 0;; ++refined) {
         // a lane has the right side of its blocks; what is not listed of a row is zero
         REAL own[EACH_LANE][2];
-        EACH_OWN (p) {
+        UNROLL_LANES
+        for (int p = 0; p < EACH_LANE; ++p) {
             const int k = lane + p * LANES;
             const Tile& y = A[joint_space::tile(NB, k < NB ? k : 0)];
             own[p][0] = y.x[0];
@@ -258,7 +259,8 @@ for (int number = 0;; ++number) {
             REAL x0, x1;
             joint_space::share_two(own, j, x0, x1);
             joint_space::divide(dof[I0 * N + j], dof[L10 * N + j], dof[I1 * N + j], x0, x1);
-            EACH_OWN (p) {
+            UNROLL_LANES
+            for (int p = 0; p < EACH_LANE; ++p) {
                 const int k = lane + p * LANES;
                 if (k == j) {
                     own[p][0] = x0;
@@ -270,7 +272,8 @@ for (int number = 0;; ++number) {
                 own[p][1] = FMA(-x.x[3], x1, FMA(-x.x[1], x0, own[p][1]));
             }
         }
-        EACH_OWN (p) {
+        UNROLL_LANES
+        for (int p = 0; p < EACH_LANE; ++p) {
             const int k = lane + p * LANES;
             if (k >= NB) continue;
             dof[CHANGE * N + 2 * k] = own[p][0];
@@ -310,7 +313,8 @@ for (int number = 0;; ++number) {
             A[joint_space::tile(NB, j)] = {{sum[0], sum[1], 0, 0}};
         }
         SYNC
-        EACH_OWN (p) {
+        UNROLL_LANES
+        for (int p = 0; p < EACH_LANE; ++p) {
             const int k = lane + p * LANES;
             const Tile& y = A[joint_space::tile(NB, k < NB ? k : 0)];
             own[p][0] = y.x[0];
@@ -321,7 +325,8 @@ for (int number = 0;; ++number) {
             REAL y0, y1;
             joint_space::share_two(own, j, y0, y1);
             joint_space::divide(dof[I0 * N + j], dof[L10 * N + j], dof[I1 * N + j], y0, y1);
-            EACH_OWN (p) {
+            UNROLL_LANES
+            for (int p = 0; p < EACH_LANE; ++p) {
                 const int k = lane + p * LANES;
                 if (k <= j || k >= NB) continue;
                 const Tile x = A[joint_space::tile(k, j)];
@@ -329,7 +334,8 @@ for (int number = 0;; ++number) {
                 own[p][1] = FMA(-x.x[3], y1, FMA(-x.x[2], y0, own[p][1]));
             }
         }
-        EACH_OWN (p) {
+        UNROLL_LANES
+        for (int p = 0; p < EACH_LANE; ++p) {
             const int k = lane + p * LANES;
             if (k < NB) A[joint_space::tile(NB, k)] = {{own[p][0], own[p][1], 0, 0}};
         }
@@ -435,5 +441,4 @@ END = r"""#undef LANES
 #undef ANY
 #undef EACH
 #undef EACH_LANE
-#undef EACH_OWN
 """

@@ -5,12 +5,10 @@ enum { CONSTANTS };
 #if defined(__CUDA_ARCH__)
 #define LANES LANE_COUNT
 #define SYNC __syncwarp();
-#define EACH_OWN(p) _Pragma("unroll") for (int p = 0; p < EACH_LANE; ++p)
 #define ANY(x) __any_sync(0xffffffffu, x)
 #else
 #define LANES 1
 #define SYNC
-#define EACH_OWN(p) for (int p = 0; p < EACH_LANE; ++p)
 #define ANY(x) (x)
 #endif
 #define EACH_LANE ((NB + LANES - 1) / LANES)

@@ -187,6 +187,7 @@ def native_text(text: str, sizes: Sizes, T: type, lanes: int, refine: int) -> st
     text = (joint_points.FUNCTIONS + joint_points.POINTS + text).replace(
         "CONSTANTS", ", ".join(f"{name} = {x}" for name, x in constants.items())
     )
+    text = text.replace("UNROLL_LANES\n", "\n#if defined(__CUDA_ARCH__)\n#pragma unroll\n#endif\n")
     text = text.replace("UNROLL\n", "#pragma unroll\n").replace("LOOP\n", "#pragma unroll 1\n")
     text = (
         text.replace("AWAY", "(REAL)INFINITY")

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from ...execution.joint_tables import joint_tables, lacking, motor_laws, way_out
-from ...execution.routine import Routine
+from ...execution.routine import Routine, SegmentForm, TuningHints
 from ...kernels import convex_pairs, convex_shapes, joint_space, near_pairs
 from ...recursions.contact import coupled, joint_system
 from ...recursions.contact.pairs import PASSES
@@ -20,10 +20,13 @@ from ...scene.contact_shapes import BOX, CYLINDER, ELLIPSOID, SWEPT_SEGMENT, Con
 from ...scene.ground import HEIGHTS
 from ...scene.scene import Scene
 from ..convex_contacts import PairShape, rotate, shape_rows
+from ..inertia import MASS_MATRIX_PACKED
 
 if TYPE_CHECKING:
     from ..dynamics import Dynamics
 
+STATES = Routine("joint_states", joint_system.joint_states, segments=SegmentForm(wide=True))
+BIAS = Routine("joint_bias", joint_system.joint_bias, segments=SegmentForm(messages="z"), hints=TuningHints(short=True))
 SYSTEM = Routine("joint_system", joint_system.joint_system)
 STATE_AFTER = Routine("joint_state_after", joint_system.state_after)
 FEW, MOST_SHARED, NARROW = 8192, 96 * 1024, 16
@@ -272,9 +275,10 @@ class JointSpaceStep:
 
         ``acting``: body_f; ctrl, target_q and target_qd of motors.
         """
-        sizes = self.tables.sizes
-        more = {joint_system.MASS: self.mass, joint_system.POSES: self.poses, joint_system.VELOCITIES: self.velocities}
-        more |= {joint_system.SCREWS: self.screws}
+        engine, sizes, more = self.dyn._engine, self.tables.sizes, dict[str, wp.array]()
+        engine.launch(MASS_MATRIX_PACKED, self.mass, q=q)
+        states = {joint_system.VELOCITIES: self.velocities, joint_system.SCREWS: self.screws}
+        engine.launch_routine(STATES, self.poses, states, q=q, qd=qd)
         more |= {joint_system.SURFACES: self.surfaces} if sizes.surfaces else {}
         if self.names is not None:
             more |= {joint_system.OF_DOFS: self.dof_values, joint_system.OF_PAIRS: self.pair_values}
@@ -282,9 +286,12 @@ class JointSpaceStep:
             more |= {joint_system.OF_MOTORS: self.motors}
         else:
             acting = {name: array for name, array in acting.items() if name == "body_f"}
+        if not more:
+            engine.launch_routine(BIAS, self.bias, q=q, qd=qd, **acting)
+            return
         options: dict[str, Any] = dict(pairs=tuple(self.tables.pairs), motors=self.motor_laws, names=self.names)
         options["surfaces"] = bool(sizes.surfaces)
-        self.dyn._engine.launch_routine(SYSTEM, self.bias, more, q=q, qd=qd, dt=dt, **acting, **options)
+        engine.launch_routine(SYSTEM, self.bias, more, q=q, qd=qd, dt=dt, **acting, **options)
 
     def step(
         self,

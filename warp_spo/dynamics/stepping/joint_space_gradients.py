@@ -83,7 +83,7 @@ class JointSpaceGradients:
         self._pull(STATE, states, q=q, qd=qd, dt=h, **{joint_system.PASSED: passed}, **seeds)
         # the passes
         solved, gains, found = self._passes_back(given, states[joint_system.PASSED], h, count)
-        self._points_back(h, found["touches"], found[joint_system.POSES])
+        self._points_back(h, found["touches"], found[derivatives.POSES])
         # the system, which depends on the state
         inputs = {name: value for name, value in acting.items() if value is not None}
         if not solver.tables.sizes.laws:
@@ -92,7 +92,7 @@ class JointSpaceGradients:
         systems = {name: self._array("system", name, results[name].shape) for name in by_system}
         options: dict[str, Any] = dict(pairs=tuple(solver.tables.pairs), motors=solver.motor_laws)
         options["surfaces"] = bool(solver.tables.sizes.surfaces)
-        names = [joint_system.SCREWS, joint_system.POSES]
+        names = [joint_system.SCREWS, derivatives.POSES]
         names += [joint_system.SURFACES] * options["surfaces"]
         names += [joint_system.OF_MOTORS] * bool(solver.tables.sizes.laws)
         seeds = {f"{name}_bar": found[name] for name in names}
@@ -138,7 +138,7 @@ class JointSpaceGradients:
         found = {name: self._array("gradient", name, like.shape) for name, like in shapes.items()}
         found["motors"] = self._array("gradient", "motors", solver.motors.shape)
         found |= {name: self._array("gradient", name, (self.worlds, self.dyn.scene.contact_count)) for name in VALUES}
-        found[joint_system.POSES] = self._array("gradient", "poses", solver.poses.shape)
+        found[derivatives.POSES] = self._array("gradient", "poses", solver.poses.shape)
         names = "tau", "q", "qd", "target_q", "target_qd", "screws", "touches", "surfaces", "motors", *VALUES
         threads = self.worlds * (joint_space.WARP if self.device.is_cuda else 1)
         inputs = [self.worlds, *read, h, float(count), cotangent]

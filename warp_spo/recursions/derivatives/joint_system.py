@@ -14,6 +14,8 @@ from .power import Power
 if TYPE_CHECKING:
     from ..model.tracing import Trace
 
+POSES = "poses"
+
 
 def joint_system_vjp(
     trace: Trace, wrt: tuple[str, ...], surfaces: bool, pairs: tuple[int, ...], motors: tuple[int, ...]
@@ -22,8 +24,9 @@ def joint_system_vjp(
 
     Their cotangents are "screws_bar" and so on. Options are those of :func:`..contact.joint_system.joint_system`.
     """
-    left_out = "out", system.MASS, system.VELOCITIES
-    results = [item for item in system.joint_system(trace, surfaces, pairs, motors) if item.array not in left_out]
+    results = [item for item in system.joint_system(trace, surfaces, pairs, motors) if item.array != "out"]
+    states = [item for item in system.joint_states(trace) if item.array != system.VELOCITIES]
+    results += [item._replace(array=POSES) if item.array == "out" else item for item in states]
     return _pull_back(trace, results, {item.array: f"{item.array}_bar" for item in results}, wrt)
 
 
