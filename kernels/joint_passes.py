@@ -52,8 +52,8 @@ for (int number = 0;; ++number) {
             }
         }
         const bool closed = (candidate && (first || push > 0)) || (last && shut);
-        across = mu * fn / sqrt(FMA(w, w, value[P_EPS] * value[P_EPS]));
-        const REAL rigid = (REAL)RIGID / (h * value[P_WEIGHT]);
+        across = mu * fn * joint_space::inverse_root(FMA(w, w, value[P_EPS] * value[P_EPS]));
+        const REAL rigid = (REAL)RIGID * joint_space::inverse(h * value[P_WEIGHT]);
         across = across > rigid ? rigid : across;
         slot[SLOT_FIELDS * at + ACROSS] = across;
         slot[SLOT_FIELDS * at + FLAG] = closed + 2 * candidate;
@@ -347,7 +347,6 @@ for (int number = 0;; ++number) {
 """
 RESULTS = r"""// -- results
 SYNC
-REAL *const excesses = s + AT_A;
 int wrong = floored;  // 1: a result is no number, or rounding is more than a pivot; 2: an input is none
 LOOP
 EACH (i, N) {
@@ -366,11 +365,11 @@ EACH (i, LAW * LAWS) wrong |= joint_space::lost(motor[i]) ? 2 : 0;
 if (dof_values.shape[0] > 1) EACH (i, DV * DOFS) wrong |= joint_space::lost(dof_value[i]) ? 2 : 0;
 LOOP
 EACH (i, SURFACES) missed = surface[i * SURFACE + 10] > 0 ? (REAL)1e30 : missed;  // comes out of the ground slowly
-excesses[5 * lane] = cone;
-excesses[5 * lane + 1] = pull;
-excesses[5 * lane + 2] = effort_excess;
-excesses[5 * lane + 3] = missed;
-excesses[5 * lane + 4] = (REAL)wrong;
+cone = joint_space::largest(cone);
+pull = joint_space::largest(pull);
+effort_excess = joint_space::largest(effort_excess);
+missed = joint_space::largest(missed);
+wrong = joint_space::any_bits(wrong);
 if (alive) {
     EACH (i, N) {
         const int own = table[T_DOF_OF + i];
@@ -421,18 +420,13 @@ if (alive) {
         contact_slip.data[row] = slip;
     }
     if (lane == 0) {
-        REAL worst[4] = {0, 0, 0, 0};
-        int all_wrong = 0;
-        LOOP
-        for (int l = 0; l < LANES; ++l) {
-            for (int e = 0; e < 4; ++e) worst[e] = excesses[5 * l + e] > worst[e] ? excesses[5 * l + e] : worst[e];
-            all_wrong |= (int)excesses[5 * l + 4];
-        }
-        for (int e = 0; e < 3; ++e) excess.data[world * 3 + e] = worst[e];
-        const bool beyond = worst[0] > most_force || worst[1] > most_force || worst[3] > most_force
-            || worst[2] > most_effort;
+        excess.data[world * 3] = cone;
+        excess.data[world * 3 + 1] = pull;
+        excess.data[world * 3 + 2] = effort_excess;
+        const REAL apart = cone > pull ? cone : pull;  // from the laws of the points
+        const bool beyond = apart > most_force || missed > most_force || effort_excess > most_effort;
         const bool crowded = total > S - SURFACES || nears[0] > NEAR;
-        status.data[world] = all_wrong & 2 ? NOT_FINITE : all_wrong ? PIVOT : crowded ? CROWDED : beyond ? CONTACT : 0;
+        status.data[world] = wrong & 2 ? NOT_FINITE : wrong ? PIVOT : crowded ? CROWDED : beyond ? CONTACT : 0;
     }
 }
 """

@@ -29,6 +29,37 @@ struct joint_space
         return y;
     }
 
+    static CUDA_CALLABLE inline REAL inverse_root(REAL x)
+    {
+#if defined(__CUDA_ARCH__)
+        return INVERSE_ROOT(x);
+#else
+        return 1 / sqrt(x);
+#endif
+    }
+
+    // The largest of a value that each lane of a world has, and the bits that any has.
+    static CUDA_CALLABLE inline REAL largest(REAL x)
+    {
+#if defined(__CUDA_ARCH__)
+        UNROLL
+        for (int d = LANES / 2; d > 0; d /= 2) {
+            const REAL other = __shfl_xor_sync(0xffffffffu, x, d);
+            x = other > x ? other : x;
+        }
+#endif
+        return x;
+    }
+
+    static CUDA_CALLABLE inline int any_bits(int x)
+    {
+#if defined(__CUDA_ARCH__)
+        UNROLL
+        for (int d = LANES / 2; d > 0; d /= 2) x |= __shfl_xor_sync(0xffffffffu, x, d);
+#endif
+        return x;
+    }
+
     // Of values that lanes have, an entry for each of their blocks, two of block j: on all lanes.
     static CUDA_CALLABLE inline void share_two(const REAL values[][2], int j, REAL& x0, REAL& x1)
     {

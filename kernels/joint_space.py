@@ -125,7 +125,7 @@ def shared_layout(sizes: Sizes, T: type) -> tuple[dict[str, int], int]:
     b, real = sizes.tiles, 4 if T is wp.float32 else 8
     starts, at = {}, 0
     reals = {
-        "AT_A": max(4 * (b * (b + 1) // 2 + b), SCREW * sizes.dofs, 5 * WARP),
+        "AT_A": max(4 * (b * (b + 1) // 2 + b), SCREW * sizes.dofs),
         "AT_J": 6 * sizes.columns * sizes.slots, "AT_SLOT": SLOT_FIELDS * sizes.slots, "AT_DOF": DOF_FIELDS * 2 * b,
         "AT_M": 4 * sizes.held,
         "AT_SHARE": sizes.laws,
@@ -198,4 +198,5 @@ def native_text(text: str, sizes: Sizes, T: type, lanes: int, refine: int) -> st
         .replace("FMA(", f"FUSED_{c}(")
     )
     inverse = 'asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));' if T is wp.float32 else "y = 1 / x;"
+    text = text.replace("INVERSE_ROOT(", "rsqrtf(" if T is wp.float32 else "rsqrt(")
     return FUSED + text.replace("INVERSE\n", f"{inverse}\n")
