@@ -75,11 +75,11 @@ def test_the_recursion_is_the_dense_step(kind, ground):
 
 
 @pytest.mark.parametrize("kinds", [("box",), pytest.param(tuple(CONTACTS), marks=pytest.mark.slow)])
-def test_the_kernel_is_the_dense_step(kinds):
+def test_the_kernel_is_the_dense_step(kinds, device):
     """Native searches find what those of the specification do; all shapes on one body, too."""
     scene = scene_of(*kinds, ground="rough" if len(kinds) == 1 else "stairs")
     a = leaning(scene, 3, 24)
-    dyn = spo.Dynamics(scene, worlds=24, dtype="float64", device="cpu")
+    dyn = spo.Dynamics(scene, worlds=24, dtype="float64", device=device)
     found = dyn.step(a["q"], a["qd"], dt=H)[1]
     for q, qd, rates in zip(a["q"], a["qd"], found, strict=True):
         wanted = ContactStep(scene, q, qd, H).run()[1].v
