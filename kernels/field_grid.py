@@ -24,7 +24,7 @@ RULES = {
 KINDS = {
     "QUADRANTS": 4, "ROW": 9, "POINT": 1, "INSIDE": 2, "VERTEX": 3, "LINE_Y": 4, "LINE_X": 5, "SIDE": 5, "RIMS": 11,
     "EDGES": 32, "STEPS": 2, "MORE": 4, "PLACE": 7, "TURNS": 3, "NEARINGS": 6, "CHOSEN": hull_corners.ROWS,
-    "CELLS": 16,
+    "FOOT": 8,
 }  # fmt: skip
 UNROLLED = {"LOOP": "1", "SOME": "8", "ALL": ""}  # words before loops, and how often these are unrolled
 

@@ -70,21 +70,33 @@ TEXT = r"""
     // centre, and the place below that.
     static CUDA_CALLABLE inline void sphere(const REAL* table, const REAL* asked, REAL* out)
     {
+        if (asked[8] < (REAL)1.5) { // a constant: one of the two is compiled, with an array that is no longer than needed
+            REAL feet[4 * FOOT];
+            nearest_cells(table, asked, 1, feet, out);
+        } else {
+            REAL feet[16 * FOOT];
+            nearest_cells(table, asked, 2, feet, out);
+        }
+    }
+
+    // ``feet``: of each cell the place there, whether that may move along x and y, the way from there to the centre, and
+    // its square, below 0 where the centre is not above the cell's plane there.
+    static CUDA_CALLABLE inline void nearest_cells(
+        const REAL* table, const REAL* asked, const int ring, REAL* feet, REAL* out)
+    {
         const REAL *cells = table + 4ll * (int)asked[0], *size = asked + 4, bottom = asked[3] - asked[10];
-        const int ring = (int)asked[8], tried = 4 * ring * ring;
-        REAL at[2], corners[4], away[CELLS][3], places[CELLS][4];
-        REAL squares[CELLS]; // below 0: the centre is not above the cell's plane there
-        int middle[2], last[2], under[2], nearest = 0;
+        const int side = 2 * ring, tried = side * side;
+        REAL at[2], corners[4];
+        int first[2], last[2], under[2], nearest = 0;
         for (int f = 0; f < 2; ++f) {
             last[f] = (int)asked[6 + f] - 2;
             const REAL x = asked[1 + f] * (1 / size[f]), most = asked[6 + f] - 1 + ring;
             at[f] = x > -ring ? (x < most ? x : most) : -ring;
-            middle[f] = (int)(at[f] + ring + (REAL)0.5) - ring;
-            const int first = middle[f] - ring, most_under = 2 * ring - 1;
-            under[f] = (int)(at[f] + ring) - ring - first;
-            under[f] = under[f] < most_under ? under[f] : most_under;
-            nearest = 2 * ring * nearest + under[f];
-            under[f] += first;
+            first[f] = (int)(at[f] + ring + (REAL)0.5) - 2 * ring;
+            under[f] = (int)(at[f] + ring) - ring - first[f];
+            under[f] = under[f] < side - 1 ? under[f] : side - 1;
+            nearest = side * nearest + under[f];
+            under[f] += first[f];
         }
         levelled(cells, under, last, corners);
         const REAL part = at[1] - under[1], low = corners[0] + part * (corners[1] - corners[0]);
@@ -93,40 +105,37 @@ TEXT = r"""
         REAL found = FAR;
         LOOP
         for (int n = 0; n < tried; ++n) {
-            const int each[2] = {middle[0] - ring + n / (2 * ring), middle[1] - ring + n % (2 * ring)};
+            const int each[2] = {first[0] + n / side, first[1] + n % side};
             const REAL x = (at[0] - each[0]) * size[0], y = (at[1] - each[1]) * size[1];
             levelled(cells, each, last, corners);
             const bool low = corners[0] < bottom && corners[1] < bottom && corners[2] < bottom && corners[3] < bottom;
-            squares[n] = FAR;
-            places[n][0] = Foot::inside(x, size[0]), places[n][1] = Foot::inside(y, size[1]);
-            places[n][2] = places[n][3] = 0;
+            REAL* here = feet + FOOT * n;
+            here[0] = Foot::inside(x, size[0]), here[1] = Foot::inside(y, size[1]), here[2] = here[3] = 0, here[7] = FAR;
             if (low) continue;
             const Foot foot(corners, size, x, y, asked[3]);
-            for (int k = 0; k < 3; ++k) away[n][k] = foot.away[k];
-            squares[n] = foot.outside ? foot.square : -foot.square;
-            for (int f = 0; f < 2; ++f) places[n][f] = foot.place[f], places[n][2 + f] = foot.free[f];
+            for (int f = 0; f < 2; ++f) here[f] = foot.place[f], here[2 + f] = foot.free[f];
+            for (int k = 0; k < 3; ++k) here[4 + k] = foot.away[k];
+            here[7] = foot.outside ? foot.square : -foot.square;
             if (foot.square < NEARER * found) nearest = n, found = foot.square;
         }
         for (int n = 0; n < 2 * PLACE; ++n) out[n] = 0;
-        const REAL* first = away[nearest];
+        const REAL* foot = feet + FOOT * nearest;
+        out[0] = above ? 1 : -1, out[1] = first[0] + nearest / side, out[2] = first[1] + nearest % side;
+        for (int f = 0; f < 4; ++f) out[3 + f] = foot[f];
+        if (!(int)asked[9] || !above || !(found < FAR)) return;
+        const REAL square = found, way[3] = {foot[4], foot[5], foot[6]};
+        found = FAR;
         LOOP
-        for (int round = 0; round < 2; ++round) { // the second looks away from what the first found
-            REAL* row = out + PLACE * round;
-            row[0] = above ? 1 : -1, row[1] = middle[0] - ring + nearest / (2 * ring);
-            row[2] = middle[1] - ring + nearest % (2 * ring);
-            for (int f = 0; f < 4; ++f) row[3 + f] = places[nearest][f];
-            if (round || !(int)asked[9] || !above || !(found < FAR)) return;
-            const REAL square = found;
-            found = FAR;
-            LOOP
-            for (int n = 0; n < tried; ++n) {
-                const REAL *w = away[n], other = squares[n];
-                if (!(other > 0 && other < NEARER * found)) continue;
-                const REAL turned = w[0] * first[0] + w[1] * first[1] + w[2] * first[2];
-                if (turned < 0 || turned * turned < APART * other * square) nearest = n, found = other;
-            }
-            if (!(found < FAR)) return;
+        for (int n = 0; n < tried; ++n) { // the second one is away from the first
+            const REAL *w = feet + FOOT * n + 4, other = w[3];
+            if (!(other > 0 && other < NEARER * found)) continue;
+            const REAL turned = w[0] * way[0] + w[1] * way[1] + w[2] * way[2];
+            if (turned < 0 || turned * turned < APART * other * square) nearest = n, found = other;
         }
+        if (!(found < FAR)) return;
+        REAL* second = out + PLACE;
+        second[0] = 1, second[1] = first[0] + nearest / side, second[2] = first[1] + nearest % side;
+        for (int f = 0; f < 4; ++f) second[3 + f] = feet[FOOT * nearest + f];
     }
 
     // The hull's own ``count`` numbers are its corners; place and presence of those that touch, see hull_corners.
