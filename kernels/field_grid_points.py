@@ -70,7 +70,7 @@ TEXT = r"""
     // centre, and the place below that.
     static CUDA_CALLABLE inline void sphere(const REAL* table, const REAL* asked, REAL* out)
     {
-        if (asked[8] < (REAL)1.5) { // a constant: one of the two is compiled, with an array that is no longer than needed
+        if (asked[8] < (REAL)1.5) { // a constant: one of the two is compiled
             REAL feet[4 * FOOT];
             nearest_cells(table, asked, 1, feet, out);
         } else {
@@ -79,8 +79,8 @@ TEXT = r"""
         }
     }
 
-    // ``feet``: of each cell the place there, whether that may move along x and y, the way from there to the centre, and
-    // its square, below 0 where the centre is not above the cell's plane there.
+    // ``feet``: of each cell the place there, whether that may move along x and y, the way from there to the centre,
+    // and its square, below 0 where the centre is not above the cell's plane there.
     static CUDA_CALLABLE inline void nearest_cells(
         const REAL* table, const REAL* asked, const int ring, REAL* feet, REAL* out)
     {
@@ -110,7 +110,8 @@ TEXT = r"""
             levelled(cells, each, last, corners);
             const bool low = corners[0] < bottom && corners[1] < bottom && corners[2] < bottom && corners[3] < bottom;
             REAL* here = feet + FOOT * n;
-            here[0] = Foot::inside(x, size[0]), here[1] = Foot::inside(y, size[1]), here[2] = here[3] = 0, here[7] = FAR;
+            here[0] = Foot::inside(x, size[0]), here[1] = Foot::inside(y, size[1]);
+            here[2] = here[3] = 0, here[7] = FAR;
             if (low) continue;
             const Foot foot(corners, size, x, y, asked[3]);
             for (int f = 0; f < 2; ++f) here[f] = foot.place[f], here[2 + f] = foot.free[f];
