@@ -34,6 +34,7 @@ from .defaults import Figure
 
 NAMES = ("G1", "T1", "H1", "Apollo", "Berkeley humanoid", "OP3", "Spot")
 WAYS = ("drives", "limp", "bare")
+EVERY = 0.01  # about so long between bases that are kept [s]
 PUSH = 0.1  # speed of the base along x and y at the start, standard deviation [m/s]
 FALLEN, LOWER = 0.8, 0.6  # tilt [rad] and share of the height at the start from which a robot has fallen
 G1_DRIVES = {  # armature [kg m^2], effort limit [N m] of mjlab's own actuators
@@ -95,25 +96,36 @@ def read(file: Path, name: str) -> Walker:
     return Walker(model, scenes, model.key(0).name)
 
 
-def roll(dyn: spo.Dynamics, q: Any, qd: Any, ctrl: Any, dt: float, seconds: float) -> tuple[np.ndarray, ...]:
-    """Return q and qd at the end, and the words of status of all steps in one, of each world."""
+class Motion(NamedTuple):
+    """The end of a motion, all words of status in one [world], and bases [time, world, 7], so long apart [s]."""
+
+    q: np.ndarray
+    qd: np.ndarray
+    said: np.ndarray
+    bases: np.ndarray
+    every: float
+
+
+def roll(dyn: spo.Dynamics, q: Any, qd: Any, ctrl: Any, dt: float, seconds: float) -> Motion:
     place = dict(dtype=dyn.dtype, device=dyn.device)
     q, qd = (wp.array(np.asarray(x), **place) for x in (q, qd))
     more = {} if ctrl is None else {"ctrl": wp.array(np.tile(ctrl, (dyn.worlds, 1)), **place)}
     status = wp.zeros(dyn.worlds, dtype=wp.int32, device=dyn.device)
-    said, every = np.zeros(dyn.worlds, np.int32), max(1, round(0.01 / dt))
+    said, every, bases = np.zeros(dyn.worlds, np.int32), round(EVERY / dt), []
     for step in range(round(seconds / dt)):
+        if step % every == 0:
+            bases.append(q.numpy()[:, :7])
         dyn.step(q, qd, None, dt, status=status, out=(q, qd), **more)
         if step % every == 0:
             said |= status.numpy()
-    return q.numpy(), qd.numpy(), said | status.numpy()
+    return Motion(q.numpy(), qd.numpy(), said | status.numpy(), np.array(bases), every * dt)
 
 
 def thrown(walker: Walker, way: str, dt: float, dyn: spo.Dynamics) -> Iterator[Figure]:
     """Yield how many worlds are lost in a second."""
     scene, worlds = walker.scenes[way], dyn.worlds
     ctrl = scene.keyframes[walker.key].ctrl if way == "drives" else None
-    q, qd, said = roll(dyn, *throws.states(scene, worlds, 0), ctrl, dt, throws.SECONDS)
+    q, qd, said, *_ = roll(dyn, *throws.states(scene, worlds, 0), ctrl, dt, throws.SECONDS)
     lost = ~(np.isfinite(q).all(axis=1) & np.isfinite(qd).all(axis=1))
     yield Figure(f"thrown, {way}: worlds lost of {worlds}", float(lost.sum()), 0.0)
     yield Figure(f"thrown, {way}: lost without a status", float((lost & (said == 0)).sum()), 0.0)
@@ -126,47 +138,52 @@ def pushes(worlds: int, dofs: int) -> np.ndarray:
     return qd
 
 
-def judged(name: str, start: np.ndarray, q: np.ndarray, qd: np.ndarray) -> Iterator[Figure]:
-    """Yield who stands, and how: ``start`` [7], ``q`` [world, ...] with the base first, its quaternion xyzw."""
+def judged(name: str, bases: np.ndarray, every: float, speeds: np.ndarray) -> Iterator[Figure]:
+    """Yield who stands at the end, and how, and when the others fell.
 
-    def up(q: np.ndarray) -> np.ndarray:
-        x, y, z, w = q[..., 3:7].T
-        return np.stack([2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)], axis=-1)
-
-    tilt = np.arccos(np.clip(up(q) @ up(start), -1.0, 1.0))
-    stands = (tilt < FALLEN) & (q[:, 2] > LOWER * start[2])
-    yield Figure(f"{name}: lost", float((~np.isfinite(q).all(axis=1)).sum()), 0.0)
+    Args:
+        bases: [time, world, 7], quaternions xyzw. every: time between them [s].
+        speeds: of the bases along the ground at the end [m/s].
+    """
+    x, y, z, w = np.moveaxis(bases[..., 3:7], -1, 0)
+    up = np.stack([2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)], axis=-1)
+    tilt = np.arccos(np.clip((up * up[0]).sum(axis=-1), -1.0, 1.0))
+    fallen = ~((tilt < FALLEN) & (bases[..., 2] > LOWER * bases[0, :, 2]))
+    stands = ~fallen[-1]
+    yield Figure(f"{name}: lost", float((~np.isfinite(bases[-1]).all(axis=1)).sum()), 0.0)
     yield Figure(f"{name}: stands, share", float(stands.mean()))
-    for group, of in (("that stand", stands), ("that fell", ~stands)):
-        if of.any():
-            yield Figure(f"{name}, of those {group}: height, median [mm]", 1e3 * float(np.median(q[of, 2])))
-            yield Figure(f"{name}, of those {group}: tilt, median [deg]", float(np.degrees(np.median(tilt[of]))))
-            speed = np.linalg.norm(qd[of, :2], axis=1)
-            yield Figure(f"{name}, of those {group}: creep of the base, median [mm/s]", 1e3 * float(np.median(speed)))
+    if stands.any():
+        yield Figure(f"{name}, stands: height, median [mm]", 1e3 * float(np.median(bases[-1, stands, 2])))
+        yield Figure(f"{name}, stands: tilt, median [deg]", float(np.degrees(np.median(tilt[-1, stands]))))
+        yield Figure(f"{name}, stands: speed, median [mm/s]", 1e3 * float(np.median(speeds[stands])))
+    if not stands.all():
+        times = every * fallen[:, ~stands].argmax(axis=0)
+        yield Figure(f"{name}, falls: time, median [s]", float(np.median(times)))
+        yield Figure(f"{name}, falls: time, standard deviation [s]", float(times.std()))
 
 
 def at_rest(walker: Walker, dt: float, seconds: float, dyn: spo.Dynamics) -> Iterator[Figure]:
     scene = walker.scenes["drives"]
     key = scene.keyframes[walker.key]
     start = np.tile(key.q, (dyn.worlds, 1))
-    q, qd, _ = roll(dyn, start, pushes(dyn.worlds, scene.dof_count), key.ctrl, dt, seconds)
-    yield from judged("at rest", start[0, :7], q, qd)
+    end = roll(dyn, start, pushes(dyn.worlds, scene.dof_count), key.ctrl, dt, seconds)
+    yield from judged("at rest", end.bases, end.every, np.linalg.norm(end.qd[:, :2], axis=1))
 
 
 def at_rest_in_mujoco(walker: Walker, seconds: float, worlds: int) -> Iterator[Figure]:
     """Yield the same of MuJoCo in the step of the file."""
-    model, found = walker.model, []
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    start = np.r_[data.qpos[:3], data.qpos[4:7], data.qpos[3]]
+    model, bases, speeds = walker.model, [], []
+    data, every = mujoco.MjData(model), round(EVERY / model.opt.timestep)
     for rates in pushes(worlds, model.nv):
         mujoco.mj_resetDataKeyframe(model, data, 0)
-        data.qvel[:] = rates
-        for _ in range(round(seconds / model.opt.timestep)):
+        data.qvel[:], base = rates, []
+        for step in range(round(seconds / model.opt.timestep)):
+            if step % every == 0:
+                base.append(data.qpos[[0, 1, 2, 4, 5, 6, 3]].copy())
             mujoco.mj_step(model, data)
-        found.append((np.r_[data.qpos[:3], data.qpos[4:7], data.qpos[3]], data.qvel.copy()))
-    q, qd = map(np.array, zip(*found, strict=True))
-    yield from judged("at rest in MuJoCo", start, q, qd)
+        bases.append(base)
+        speeds.append(np.linalg.norm(data.qvel[:2]))
+    yield from judged("at rest in MuJoCo", np.stack(bases, axis=1), every * model.opt.timestep, np.array(speeds))
 
 
 def main(arguments: list[str] | None = None) -> int:
