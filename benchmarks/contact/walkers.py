@@ -7,7 +7,7 @@ FOLDERs hold unpacked packages, see :mod:`benchmarks.robots_of_others`. "throws"
 air, with drives, limp (without drives), and bare (also without armature, damping and friction of joints); no world may
 be lost. "rest": the robot's own controls of its first keyframe for some seconds, each world pushed by another speed of
 0.1 m/s, and the same files and states in MuJoCo with its own step; printed is who stands at the end, and how. mjlab
-gives its G1 drives in Python: those are written into the file here, and a plane.
+gives its G1 drives in Python, which are written into the file here; a file without a plane is given one.
 """
 
 from __future__ import annotations
@@ -58,10 +58,9 @@ class Walker(NamedTuple):
 
 
 def g1_with_drives(spec: mujoco.MjSpec) -> None:
-    """Give mjlab's G1 its drives, a keyframe with bent knees and a plane; its shapes touch nothing but that."""
+    """Give mjlab's G1 its drives and a keyframe with bent knees; its shapes touch nothing but the ground."""
     for geom in spec.geoms:
         geom.contype = 0
-    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05])
     targets = []
     for joint in (joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE):
         joint.armature, effort = next(x for part, x in G1_DRIVES.items() if re.search(part, joint.name))
@@ -76,10 +75,12 @@ def g1_with_drives(spec: mujoco.MjSpec) -> None:
 
 
 def read(file: Path, name: str) -> Walker:
-    """Return a robot of a file, without meshes, on the plane."""
+    """Return a robot of a file, without meshes, on its plane or another one."""
     spec, scenes = mujoco.MjSpec.from_string(without_meshes(file).text), {}
     if name == "G1":
         g1_with_drives(spec)
+    if not any(geom.type == mujoco.mjtGeom.mjGEOM_PLANE for geom in spec.geoms):
+        spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05])
     model = spec.compile()
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
