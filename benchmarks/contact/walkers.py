@@ -80,7 +80,8 @@ def read(file: Path, name: str) -> Walker:
     if name == "G1":
         g1_with_drives(spec)
     if not any(geom.type == mujoco.mjtGeom.mjGEOM_PLANE for geom in spec.geoms):
-        spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05])
+        floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05])
+        floor.contype = floor.conaffinity = 1
     model = spec.compile()
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -115,7 +116,7 @@ def roll(dyn: spo.Dynamics, q: Any, qd: Any, ctrl: Any, dt: float, seconds: floa
     said, every, bases = np.zeros(dyn.worlds, np.int32), round(EVERY / dt), []
     for step in range(round(seconds / dt)):
         if step % every == 0:
-            bases.append(q.numpy()[:, :7])
+            bases.append(q.numpy()[:, :7].copy())
         dyn.step(q, qd, None, dt, status=status, out=(q, qd), **more)
         if step % every == 0:
             said |= status.numpy()
