@@ -42,6 +42,10 @@ ENVIRONMENTS = [
     (dict(actions=actions.Effort("slide", scale=NAN)), "scale is nan; expected finite numbers"),
     (dict(events=events.joints()), r"events is Reset.*expected a list"),
     (dict(events=[events.servo_gains()]), "an event changes actuator_gain, of which the scene has none"),
+    (
+        dict(observations={"a": [TorchTerm(Q, name="b/c")], "a/b": [TorchTerm(Q, name="c")]}),
+        "two terms are counted as observation/a/b/c; expected other names",
+    ),
     (dict(events=[events.encoder_bias(0.1, "slide"), events.encoder_bias(0.1, "hinge")]), "two encoder_bias"),
 ]
 

@@ -301,7 +301,7 @@ class Env(VecEnv):
 
     # -- stepping --------------------------------------------------------------------------------------------------
     def get_observations(self) -> Any:
-        """Return the observations of the present state, a TensorDict of [world, number] by group."""
+        """Return the observations of the last step or reset, a TensorDict of [world, number] by group."""
         return self._observations(self._store.out.clone())
 
     def reset(self, mask: torch.Tensor | None = None, seed: int | Sequence[int] | None = None) -> tuple[Any, dict]:
