@@ -20,6 +20,8 @@ from .source import Source
 
 FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{n}")) for n in ("FREE", "BALL", "SLIDE", "HINGE"))
 KINDS = {FREE: "free", BALL: "ball", SLIDE: "prismatic", HINGE: "revolute"}
+TO_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+"""Transmissions of actuators to a joint."""
 SIZES = {FREE: (7, 6), BALL: (4, 3), SLIDE: (1, 1), HINGE: (1, 1)}
 """Entries of qpos and of qvel by joint type."""
 ROUNDING = 8 * np.finfo(np.float64).eps
@@ -168,14 +170,16 @@ class Mechanism:
         return values
 
     def _actuator_values(self, joint: int) -> dict[str, float]:
-        """Return the armature and damping of the actuator that gives them to a joint, seen through its gear."""
-        m, owner = self.source.model, self.source.field("jnt_actuatorid")
-        if owner is None or owner[joint] < 0:
-            return {}
-        actuator = int(owner[joint])
-        gear = float(m.actuator_gear[actuator_output(self.source, actuator), 0])
-        found = {name: self.source.field(f"actuator_{name}") for name in ("armature", "damping")}
-        return {name: gear**2 * float(values[actuator]) for name, values in found.items() if values is not None}
+        """Return the armature and damping that actuators give to a joint, each seen through its gear."""
+        m, source = self.source.model, self.source
+        found = {name: source.field(f"actuator_{name}") for name in ("armature", "damping")}
+        on_joint = np.isin(m.actuator_trntype, TO_JOINT) & (m.actuator_trnid[:, 0] == joint)
+        gears = {int(a): float(m.actuator_gear[actuator_output(source, int(a)), 0]) for a in np.flatnonzero(on_joint)}
+        return {
+            name: sum(gear**2 * float(values[actuator]) for actuator, gear in gears.items())
+            for name, values in found.items()
+            if values is not None
+        }
 
     # -- another base ----------------------------------------------------------------------------------------------
     def _replaces(self, body: int, floating: bool) -> bool:
