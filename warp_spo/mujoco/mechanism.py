@@ -40,7 +40,6 @@ class Mechanism:
     Attributes:
         bodies, hinges: of the scene.
         hinge_of: index of the hinge by joint of the model; joints that ``floating`` replaced are not in it.
-        starts: coordinates at which a free hinge that ``floating`` added stands in the file, by hinge.
     """
 
     def __init__(self, source: Source, floating: bool | None = None):
@@ -50,7 +49,6 @@ class Mechanism:
         self.bodies = [self._body(body) for body in range(1, model.nbody)]
         self.hinges: list[Hinge] = []
         self.hinge_of: dict[int, int] = {}
-        self.starts: dict[int, np.ndarray] = {}
         for body in range(1, model.nbody):
             if floating is not None and self._replaces(body, floating):
                 self._replace(body, floating)
@@ -195,7 +193,6 @@ class Mechanism:
     def _replace(self, body: int, floating: bool) -> None:
         pose, own = body_pose(self.source.model, body), self._label(body)
         if floating:
-            self.starts[len(self.hinges)] = pose
             self.hinges.append(Hinge("free", -1, body - 1, rest=pose, label=self._joint_label(f"{own}_free")))
         else:
             self.hinges.append(Hinge("fixed", -1, body - 1, parent_pose=pose, label=self._joint_label(f"{own}_fixed")))
