@@ -24,7 +24,7 @@ from ..worlds import quote_labels
 from .inertia_repair import repair_bodies
 from .urdf_masses import mass_of_shapes
 from .urdf_mimics import SCALAR, read_mimics
-from .urdf_shapes import urdf_pairs, urdf_shapes
+from .urdf_shapes import check_for_mass, urdf_pairs, urdf_shapes
 from .urdf_unknown import warn_of_unknown
 from .urdf_up_axis import turn_meshes
 from .xml_source import XmlElement, read_xml
@@ -79,7 +79,7 @@ def read_urdf(file: Path, floating: bool | None, repair: bool, selection: ShapeS
     couplings, held = read_mimics(carried)
     hinges = [base, *(_hinge(joint, number, label, held.get(index)) for index, joint in enumerate(carried))]
     _warn_of_limits(carried, held)
-    warn_of_unknown(file, [*carried, *links.values()])
+    warn_of_unknown(file, robot, [*carried, *links.values()])
     inertials = _inertials([links[link] for link in number], hinges, repair)
     masses, inertias = [i[0] for i in inertials], [i[2] for i in inertials]
     try:
@@ -350,6 +350,8 @@ def _inertials(links: list[XmlElement], hinges: list[Hinge], repair: bool) -> li
         if not repair or weights[group[index]] != 0.0 or not shapes or link.find("inertial") is not None:
             continue
         if moves or link.find("collision//mesh") is None:
+            if moves:
+                check_for_mass(link)
             inertials[index] = mass_of_shapes(link)
             weighed += [link] * moves
     if weighed:
