@@ -34,7 +34,7 @@ def mass_of_shapes(link: XmlElement) -> tuple[float, np.ndarray, np.ndarray]:
             new.set("filename", str(file))
             new.set("scale", " ".join(map(repr, scale.tolist())))
         for capsule in alone[-1].iter("capsule"):
-            capsule.set("height", capsule.get("height") or capsule.get("length", ""))  # Newton reads no length
+            capsule.set("height", capsule.get("height") or capsule.get("length") or "")  # Newton reads no length
     builder = newton.ModelBuilder()
     try:
         builder.add_urdf(ET.tostring(robot, encoding="unicode"))
