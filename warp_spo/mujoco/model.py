@@ -139,8 +139,9 @@ def state_of(source: Source, mechanism: Mechanism, qpos: np.ndarray, qvel: np.nd
     q, qd = [np.zeros(0)], [np.zeros(0)]
     for index, hinge in enumerate(mechanism.hinges):
         if index not in joint_of:
-            start = mechanism.starts.get(index, np.zeros(0))
-            q, qd = [*q, start], [*qd, np.zeros(hinge.dof_count)]
+            if hinge.dof_count:  # a base that the caller set free
+                pose, rates = _motion_of_body(m, hinge.child + 1, qpos, qvel)
+                q, qd = [*q, pose], [*qd, rates]
             continue
         joint = joint_of[index]
         kind, adr, dof = int(m.jnt_type[joint]), int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])
@@ -153,6 +154,17 @@ def state_of(source: Source, mechanism: Mechanism, qpos: np.ndarray, qvel: np.nd
                 rates[:3] += np.cross(rates[3:], axes @ mechanism.bodies[hinge.child].com)
         q, qd = [*q, scene_entries(kind, qpos, adr)], [*qd, rates]
     return np.concatenate(q), np.concatenate(qd)
+
+
+def _motion_of_body(m: Any, body: int, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pose of a body and its velocity, that of its centre of mass first, as of a free hinge."""
+    data, twist = mujoco.MjData(m), np.zeros(6)
+    data.qpos, data.qvel = qpos, qvel
+    mujoco.mj_kinematics(m, data)
+    mujoco.mj_comPos(m, data)
+    mujoco.mj_comVel(m, data)
+    mujoco.mj_objectVelocity(m, data, mujoco.mjtObj.mjOBJ_BODY, body, twist, 0)
+    return np.concatenate([data.xpos[body], xyzw(data.xquat[body])]), np.concatenate([twist[3:], twist[:3]])
 
 
 def _softness(source: Source) -> Iterator[str]:
