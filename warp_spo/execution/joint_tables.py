@@ -1,4 +1,4 @@
-"""What a solver in joint space reads of a scene: the order of its dofs, their axes and laws, and its pairs."""
+"""Tables that a solver in joint space reads of a scene: the order of its dofs, their axes and laws, and its pairs."""
 
 from __future__ import annotations
 
