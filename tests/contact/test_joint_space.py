@@ -145,15 +145,17 @@ def test_float32_is_refined(device):
 
 
 def test_bits_do_not_depend_on_other_worlds(device):
-    """A world alone, and, on a GPU, with any number of lanes."""
+    """A world alone, by the kernel for few points or the one for many, and, on a GPU, with any number of lanes."""
     solver, (q, qd, tau) = made("pinch", 4, str(device), "float32")
     found = stepped(solver, q, qd, tau)
     alone, _ = made("pinch", 1, str(device), "float32")
     for w in range(4):
         for one, all_of in zip(stepped(alone, q[w : w + 1], qd[w : w + 1], tau[w : w + 1]), found, strict=True):
             np.testing.assert_array_equal(one[0], all_of[w])
-    for lanes in (8, 16, 32) if device.is_cuda else ():
-        other, _ = made("pinch", 4, str(device), "float32", lanes=lanes)
+    variants = [dict(few=few) for few in (0, 7, 8, 40)]  # worlds have eight points
+    variants += [dict(lanes=lanes, few=8) for lanes in (8, 16, 32)] if device.is_cuda else []
+    for options in variants:
+        other, _ = made("pinch", 4, str(device), "float32", **options)
         for one, all_of in zip(stepped(other, q, qd, tau), found, strict=True):
             np.testing.assert_array_equal(one, all_of)
 

@@ -50,7 +50,7 @@ def joint_tables(
     ``near``: pairs at most that are near in a world. ``slots``: points of pairs at most. ``surfaces``: of each point
     with the ground, the numbers of the surfaces that it may touch. ``motors``: see :func:`motor_laws`. ``routines``: of
     each pair the number of the routine that finds its points; pairs of one follow each other, so that threads of a warp
-    find the points of like pairs.
+    find the points of like pairs; those of routines with high numbers, which take longest, come first.
     """
     dofs_of = _dofs_by_body(scene)
     ways = _ways(scene)
@@ -58,7 +58,7 @@ def joint_tables(
     position = {dof: i for i, dof in enumerate(order) if dof >= 0}
     tiles = len(order) // 2
     couples, columns = _couples(scene, dofs_of, ways, position)
-    pairs = sorted(range(len(scene.contact_pairs)), key=lambda i: (routines[i], i))
+    pairs = sorted(range(len(scene.contact_pairs)), key=lambda i: (-routines[i], i))
     rows, cols = pattern
     sizes = joint_space.Sizes(
         scene.dof_count, tiles, len(rows), len(pairs), len(couples), max(map(len, columns), default=0), near,

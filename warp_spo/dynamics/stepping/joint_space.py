@@ -29,9 +29,10 @@ STATES = Routine("joint_states", joint_system.joint_states, segments=SegmentForm
 BIAS = Routine("joint_bias", joint_system.joint_bias, segments=SegmentForm(messages="z"), hints=TuningHints(short=True))
 SYSTEM = Routine("joint_system", joint_system.joint_system)
 STATE_AFTER = Routine("joint_state_after", joint_system.state_after)
-FEW, MOST_SHARED, NARROW = 8192, 96 * 1024, 16
-"""Worlds up to which each takes a warp, and shared memory of a block above which it does, too [bytes]; but half a warp
-where there are at most NARROW dofs, see docs/measured_facts.md."""
+FEW, MOST_SHARED, NARROW, WIDE = 1024, 96 * 1024, 16, 32
+"""A world takes a quarter of a warp where there are at most NARROW dofs, half a warp otherwise; with up to FEW worlds
+twice as much. It takes a whole one where there are over WIDE dofs, and where a warp of two worlds would take over
+MOST_SHARED bytes of shared memory; see docs/measured_facts.md."""
 ROOM = 227 * 1024  # shared memory of a block [bytes]
 MARGIN = 5e-3  # how near shapes are looked at whatever their speeds [m]; a drive at 1000 m/s^2 moves so far in 3 ms
 TINY = 1e-9  # radius of a point among shapes [m]
@@ -154,8 +155,8 @@ class JointSpaceStep:
         parts = [sizes._replace(slots=few, leaves=True), sizes._replace(least=few)] if few < sizes.slots else [sizes]
         self.tables = tables = tables._replace(sizes=sizes)
         crowded = 2 * joint_space.world_bytes(parts[0], T) > MOST_SHARED
-        narrow = scene.dof_count <= NARROW and not crowded
-        self.lanes = lanes or (32 if crowded or (dyn.worlds <= FEW and not narrow) else 16)
+        narrow = (8 if scene.dof_count <= NARROW else 16) * (2 if dyn.worlds <= FEW else 1)
+        self.lanes = lanes or (32 if crowded or scene.dof_count > WIDE else narrow)
         array: Any = functools.partial(wp.array, dtype=T, device=self.device)
         make = lambda *shape, dtype=T: wp.zeros(shape, dtype=dtype, device=self.device)  # noqa: E731
         varies = any(self._varies(name) for name in (*joint_system.LAWS.values(), *joint_system.OTHERS))
@@ -287,7 +288,8 @@ class JointSpaceStep:
         else:
             acting = {name: array for name, array in acting.items() if name == "body_f"}
         if not more:
-            engine.launch_routine(BIAS, self.bias, q=q, qd=qd, **acting)
+            given: dict[str, Any] = acting
+            engine.launch_routine(BIAS, self.bias, q=q, qd=qd, **given)
             return
         options: dict[str, Any] = dict(pairs=tuple(self.tables.pairs), motors=self.motor_laws, names=self.names)
         options["surfaces"] = bool(sizes.surfaces)
