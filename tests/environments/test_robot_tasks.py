@@ -45,6 +45,7 @@ def test_a_robot_stands_where_its_file_has_it(tmp_path):
     qpos = mujoco.MjModel.from_xml_string(BALANCER).qpos0
     np.testing.assert_allclose(chosen.START, [*qpos[:3], *np.roll(qpos[3:7], -1), *qpos[7:]], atol=1e-6)
     assert (tmp_path / chosen.ROBOT).is_file()
+    assert f"below({round(0.5 * qpos[2], 3)})" in (tmp_path / "robot_task.py").read_text()  # it does not lie
     floorless = BALANCER.replace('<geom type="plane" size="0 0 .1"/>', "")
     for text, reads in ((BALANCER, 'ROBOT, contacts="ground")'), (floorless, 'ROBOT, contacts="*")'), (ARM, "ROBOT)")):
         file = new_file(text, tmp_path, f"robot_{len(reads)}")

@@ -167,6 +167,12 @@ def _spreads(scene: Any, single: list[int], limited: list[str]) -> list[str]:
     ]
 
 
+def _start_height(scene: Any) -> float:
+    """Return the height of the base of a robot that floats, where episodes start [m]."""
+    first = next(iter(scene.keyframes.values())).q if scene.keyframes else scene.initial_q
+    return float(first[2])
+
+
 def _build(scene: Any, single: list[int], endless: list[str], floats: bool, reads: str) -> str:
     action, meaning = _action(scene)
     limited = [label for i in single if (label := scene.joint_labels[i]) not in endless]
@@ -187,7 +193,11 @@ def _build(scene: Any, single: list[int], endless: list[str], floats: bool, read
         changes = ["events.base(yaw=(-np.pi, np.pi), pitch=(-0.05, 0.05))", *changes, "events.push(velocity=0.3)"]
         more = """
         commands=commands.Velocity(forward=(-0.5, 0.5), left=(0.0, 0.0), turn=(-1.0, 1.0), seconds=(3.0, 8.0)),
-        terminations={"fell over": terminations.tilted(np.radians(60.0))},"""
+        terminations={"""
+        low = round(0.5 * _start_height(scene), 3)
+        ends = ['"fell over": terminations.tilted(np.radians(60.0))']
+        ends += [f'"lies": terminations.below({low})'] if low > 0.0 else []  # or it learns to lie down
+        more += ", ".join(ends) + "},"
     else:
         goal, more = '            "pose": (1.0, rewards.posture(0.3)),', ""
     rows = lambda parts: "\n".join(f"            {part}," for part in parts)  # noqa: E731
