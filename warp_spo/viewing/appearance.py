@@ -118,9 +118,7 @@ def _imported(file: Path, scene: Scene) -> Appearance:
         stage = Usd.Stage.Open(str(file))
         unit = float(UsdGeom.GetStageMetersPerUnit(stage))
         with warnings.catch_warnings():
-            warnings.filterwarnings(
-                "ignore", "USD stages with non-unit", newton.NewtonWarning
-            )
+            warnings.filterwarnings("ignore", "USD stages with non-unit", newton.NewtonWarning)
             builder.add_usd(stage, load_sites=False)
     body_of = {label: body for body, label in enumerate(scene.body_labels)}
     rows = {row: body_of[label] for row, label in enumerate(builder.body_label) if label in body_of}
