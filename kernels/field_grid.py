@@ -24,7 +24,7 @@ RULES = {
 KINDS = {
     "QUADRANTS": 4, "ROW": 9, "POINT": 1, "INSIDE": 2, "VERTEX": 3, "LINE_Y": 4, "LINE_X": 5, "SIDE": 5, "RIMS": 11,
     "EDGES": 32, "STEPS": 2, "MORE": 4, "PLACE": 7, "TURNS": 3, "NEARINGS": 6, "CHOSEN": hull_corners.ROWS,
-    "CELLS": 16,
+    "FOOT": 8, "TOGETHER": 4,
 }  # fmt: skip
 UNROLLED = {"LOOP": "1", "SOME": "8", "ALL": ""}  # words before loops, and how often these are unrolled
 
@@ -90,6 +90,21 @@ GRID = r"""
             return (low + part * (high - low)) / cell[f];
         }
 
+        // Whether the field falls away along its lines from a plane with the normal (x, y, up) at a grid point.
+        CUDA_CALLABLE inline bool is_top(int i, int j, REAL x, REAL y, REAL up) const
+        {
+            bool top = true;
+            LOOP
+            for (int f = 0; f < 2; ++f) {
+                const int line = f == 0 ? i : j, aside = f == 0 ? j : i, last = f == 0 ? count[1] - 2 : count[0] - 2;
+                const int m = aside < last ? aside : last;
+                const REAL part = aside - m, rises = f == 0 ? -x : -y;
+                top &= slope_beside(line, m, part, f, -1) * up >= rises;
+                top &= slope_beside(line, m, part, f, 0) * up <= rises;
+            }
+            return top;
+        }
+
         CUDA_CALLABLE inline REAL limited(REAL x, int f) const
         {
             const REAL most = count[f] - 1;
@@ -134,6 +149,12 @@ GRID = r"""
                 i += ends, j = ends ? first[1] : j + 1;
             }
             return far;
+        }
+
+        // By how much a direction in the axes of the shape leads up.
+        CUDA_CALLABLE inline REAL upward(const REAL* of) const
+        {
+            return of[0] * axes[2] + of[1] * axes[5] + of[2] * axes[8];
         }
 
         // The axis k of the shape on the direction (x, y, z).

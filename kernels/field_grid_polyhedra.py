@@ -190,12 +190,18 @@ TEXT = r"""
             LOOP
             for (int j = field.low[1]; j <= field.high[1]; ++j) {
                 if (field.is_low(i, j)) continue;
-                REAL q[3], depth = FAR, side = FAR, normal[3] = {0, 0, 0}, offset = 0;
+                REAL q[3], depth = FAR, side = FAR, normal[3] = {0, 0, 0}, offset = 0, steep = FAR;
                 shape.from_middle(i, j, q);
-                int face = -1;
+                int face = -1, aside = -1;
                 for (int k = 0; k < 3; ++k) {
-                    const REAL inside = half[k] + (A[3 * k + 2] > 0 ? q[k] : -q[k]);
-                    if (on::absolute(A[3 * k + 2]) >= DOWN && inside < depth) face = k, depth = inside;
+                    const REAL down = on::absolute(A[3 * k + 2]), inside = half[k] + (A[3 * k + 2] > 0 ? q[k] : -q[k]);
+                    if (down >= DOWN && inside < depth) face = k, depth = inside;
+                    if (down >= LOW && down < DOWN && inside < steep) aside = k, steep = inside;
+                }
+                if (steep < depth) {
+                    const REAL* up = A + 3 * aside;
+                    const REAL turn = up[2] > 0 ? 1 : -1;
+                    if (field.is_top(i, j, turn * up[0], turn * up[1], turn * up[2])) face = aside, depth = steep;
                 }
                 if (face < 0) continue;
                 for (int k = 0; k < 3; ++k) {
@@ -234,25 +240,33 @@ TEXT = r"""
             LOOP
             for (int j = field.low[1]; j <= field.high[1]; ++j) {
                 if (field.is_low(i, j)) continue;
-                REAL q[3], depth = FAR, side = FAR;
+                REAL q[3], depth = FAR, side = FAR, steep = FAR;
                 shape.from_middle(i, j, q);
-                int face = -1;
+                int face = -1, aside = -1;
                 LOOP
                 for (int n = 0; n < faces; ++n) {
                     const REAL* each = of + 1 + 4 * n;
-                    if (!(each[0] * A[2] + each[1] * A[5] + each[2] * A[8] <= -DOWN)) continue;
+                    const REAL down = -field.upward(each);
+                    if (!(down >= LOW)) continue;
                     const REAL inside = each[3] - each[0] * q[0] - each[1] * q[1] - each[2] * q[2];
-                    if (inside < depth) face = n, depth = inside;
+                    if (down >= DOWN && inside < depth) face = n, depth = inside;
+                    if (down < DOWN && inside < steep) aside = n, steep = inside;
+                }
+                if (steep < depth) {
+                    const REAL* out = of + 1 + 4 * aside;
+                    REAL up[3];
+                    for (int x = 0; x < 3; ++x) up[x] = -(out[0] * A[x] + out[1] * A[3 + x] + out[2] * A[6 + x]);
+                    if (field.is_top(i, j, up[0], up[1], up[2])) face = aside, depth = steep;
                 }
                 if (face < 0) continue;
                 const REAL* normal = of + 1 + 4 * face;
                 LOOP
                 for (int n = 0; n < faces; ++n) {
                     const REAL* each = of + 1 + 4 * n;
-                    const bool looks = each[0] * A[2] + each[1] * A[5] + each[2] * A[8] <= -DOWN;
+                    const bool looks = field.upward(each) <= -DOWN;
                     const bool against = each[0] * normal[0] + each[1] * normal[1] + each[2] * normal[2] <= -DOWN;
                     const REAL inside = each[3] - each[0] * q[0] - each[1] * q[1] - each[2] * q[2];
-                    if (!looks && !against) side = least(side, inside);
+                    if (n != face && !looks && !against) side = least(side, inside);
                 }
                 shape.take_point(i, j, q, depth, side, normal, normal[3]);
             }

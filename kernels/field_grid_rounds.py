@@ -16,14 +16,16 @@ TEXT = r"""
         }
         if (leans) beside_axis(field, shape.best, 0, SIDE, shape.sideways);
         const int end = lean > 0 ? -1 : 1;
-        if (on::absolute(lean) >= DOWN) {
-            const REAL down[3] = {0, 0, (REAL)end};
+        if (on::absolute(lean) >= LOW) {
+            const REAL down[3] = {0, 0, (REAL)end}, *up = field.axes + 6;
+            const bool steep = on::absolute(lean) < DOWN;
             if (leans) shape.slack = 0;
             LOOP
             for (int i = field.low[0]; i <= field.high[0]; ++i) {
                 LOOP
                 for (int j = field.low[1]; j <= field.high[1]; ++j) {
                     if (field.is_low(i, j)) continue;
+                    if (steep && !field.is_top(i, j, -end * up[0], -end * up[1], -end * up[2])) continue;
                     REAL q[3];
                     shape.from_middle(i, j, q);
                     const REAL side = radius - on::sqrt(q[0] * q[0] + q[1] * q[1]);

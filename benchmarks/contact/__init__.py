@@ -9,5 +9,5 @@ against run time. ``peers``: steps beside mujoco_warp and Newton's solvers, on a
 and jumps. ``terrain``: a picture of the kinds of terrain. ``shapes``: shapes on fields and planes beside truths.
 ``narrow_phase``: points of every pair of convex shapes beside truths, and their time on a GPU.
 ``uneven``: boxes and capsules on fields beside dense sampling, on a stair's edge and across a ridge. All but
-``scenes`` and ``courses`` are commands.
+``scenes`` and ``courses`` are commands. ``walkers``: robots of other packages thrown, and at rest beside MuJoCo.
 """

@@ -67,6 +67,19 @@ def test_none_is_missed(kind, name):
     assert (abs(found - depths) > uneven.CLOSE).sum() <= 1, (found, depths)
 
 
+def test_a_tip_under_a_face_that_looks_aside():
+    """The outer corner of a stair 2.3 mm inside of a box, whose face there leads 62 degrees away from down."""
+    field, _ = shapes.fields()["outer corner of 10 cm"]
+    turn = np.array([0.18927052, 0.47894735, 0.4993311, 0.69674569])
+    pose = np.r_[0.02396194, -0.02592651, 0.10580132, turn / np.linalg.norm(turn)]
+    q = rotation(pose[3:]).T @ (np.array([0.0, 0.0, 0.1]) - pose[:3])
+    true = uneven.SHAPES["box"].inside(q[None]).max()
+    scene = box().with_contacts([spo.Contact(0, **uneven.SHAPES["box"].contact)], field)
+    assert abs(true - 2.3e-3) < 1e-4
+    assert abs(ContactStep(scene, pose, np.zeros(6), 1e-3).points.depth.max() - true) < 1e-9
+    assert abs(uneven.found_depths(field, uneven.SHAPES["box"], pose[None])[0] - true) < 1e-9
+
+
 @pytest.mark.parametrize("kind", CONTACTS)
 @pytest.mark.parametrize("ground", FIELDS)
 def test_the_recursion_is_the_dense_step(kind, ground):
@@ -75,11 +88,11 @@ def test_the_recursion_is_the_dense_step(kind, ground):
 
 
 @pytest.mark.parametrize("kinds", [("box",), pytest.param(tuple(CONTACTS), marks=pytest.mark.slow)])
-def test_the_kernel_is_the_dense_step(kinds):
+def test_the_kernel_is_the_dense_step(kinds, device):
     """Native searches find what those of the specification do; all shapes on one body, too."""
     scene = scene_of(*kinds, ground="rough" if len(kinds) == 1 else "stairs")
     a = leaning(scene, 3, 24)
-    dyn = spo.Dynamics(scene, worlds=24, dtype="float64", device="cpu")
+    dyn = spo.Dynamics(scene, worlds=24, dtype="float64", device=device)
     found = dyn.step(a["q"], a["qd"], dt=H)[1]
     for q, qd, rates in zip(a["q"], a["qd"], found, strict=True):
         wanted = ContactStep(scene, q, qd, H).run()[1].v

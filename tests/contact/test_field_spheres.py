@@ -42,7 +42,7 @@ def test_a_ball_on_a_slope(friction):
     assert np.diff(energy).max() < 1e-8
 
 
-def test_a_sphere_above_a_tip_is_outside():
+def test_a_sphere_above_a_tip_is_outside(device):
     """Whatever the planes of its steep sides say, and whether gaps are asked for or not: no gap is below -radius."""
     heights, radius, worlds = np.zeros((13, 13)), 0.03, 2000
     heights[6, 6] = 0.15
@@ -56,7 +56,7 @@ def test_a_sphere_above_a_tip_is_outside():
     q[:, :2], q[:, 2] = rng.uniform(-0.1, 0.1, (worlds, 2)), rng.uniform(0.1, 0.3, worlds)
     x, y = np.abs(q[:, 0]), np.abs(q[:, 1])
     q = q[q[:, 2] > 0.15 * np.maximum(1.0 - x / 0.05, 0.0) * np.maximum(1.0 - y / 0.05, 0.0)]
-    dyn = spo.Dynamics(scene, len(q), "cpu", "float64")
+    dyn = spo.Dynamics(scene, len(q), device, "float64")
     report = dyn.step_report("contact_gap", like=q)
     asked, free = dyn.step(q, qd[: len(q)], None, 2e-3, report=report), dyn.step(q, qd[: len(q)], None, 2e-3)
     assert report.contact_gap.min() >= -radius and all(np.array_equal(*pair) for pair in zip(asked, free, strict=True))
@@ -160,7 +160,7 @@ def test_beyond_the_edge_a_field_is_level_across_it(kind):
 
 
 @pytest.mark.parametrize("radius", [0.05, 0.09])
-def test_a_sphere_before_the_edge_of_a_field_touches_its_slope(radius):
+def test_a_sphere_before_the_edge_of_a_field_touches_its_slope(radius, device):
     """The nearest point is on the slope inside: its depth is r - (z cos t - x sin t); in the kernel, too."""
     slope, angle = np.tan(np.radians(20.0)), np.radians(20.0)
     field = spo.HeightField(np.repeat(slope * np.arange(9)[:, None] * 0.1, 9, 1), 0.1, (0.0, -0.4))
@@ -171,7 +171,7 @@ def test_a_sphere_before_the_edge_of_a_field_touches_its_slope(radius):
     depths[1] = 2e-4
     found = [ContactStep(scene, one, np.zeros(6), H).points.depth.max() for one in q]
     np.testing.assert_allclose(found[:2], depths[:2], atol=1e-9)
-    dyn = spo.Dynamics(scene, worlds=3, dtype="float64", device="cpu")
+    dyn = spo.Dynamics(scene, worlds=3, dtype="float64", device=device)
     report = dyn.step_report("contact_gap", like=q)
     dyn.step(q, np.zeros((3, 6)), dt=H, report=report)
     np.testing.assert_allclose(-report.contact_gap[:, 0], found, atol=1e-12)

@@ -96,11 +96,11 @@ def test_the_recursion_of_a_hull_is_the_dense_step(ground):
 
 
 @pytest.mark.parametrize("ground", ["plane", "stairs"])
-def test_the_kernel_of_a_hull_is_the_dense_step(ground):
+def test_the_kernel_of_a_hull_is_the_dense_step(ground, device):
     ground = TILTED if ground == "plane" else FIELDS[ground]
     scene = box().with_contacts([spo.Contact(0, hull=STONE, friction=0.4)], ground)
     a = {name: rows[:-1] for name, rows in above(scene, 5, 9).items()}
-    dyn = spo.Dynamics(scene, worlds=8, dtype="float64", device="cpu")
+    dyn = spo.Dynamics(scene, worlds=8, dtype="float64", device=device)
     for q, qd, rates in zip(a["q"], a["qd"], dyn.step(a["q"], a["qd"], dt=H)[1], strict=True):
         wanted = ContactStep(scene, q, qd, H).run()[1].v
         np.testing.assert_allclose(rates, wanted, atol=1e-9 * np.abs(wanted).max())
@@ -108,7 +108,7 @@ def test_the_kernel_of_a_hull_is_the_dense_step(ground):
 
 @pytest.mark.parametrize("kind", ROUND)
 def test_paths_bend_as_heights_do(kind):
-    """What a point at rates that stay rises beyond its speed: second differences of its height."""
+    """Acceleration at which a point rises at rates that stay: second differences of its height."""
     scene, t = scene_of(kind), 1e-4
     for state in np.random.default_rng(1).normal(size=(6, 13)):
         q, qd = np.concatenate([state[:3], state[3:7] / np.linalg.norm(state[3:7])]), 5.0 * state[7:]
@@ -159,7 +159,7 @@ def test_a_wheel_rolls():
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_a_hull_of_many_corners_rests_on_a_sloping_cell(dtype):
+def test_a_hull_of_many_corners_rests_on_a_sloping_cell(dtype, device):
     """A prism of twelve corners that lies flat on slopes of 3 to 20 degrees sinks by m g cos t / (n k) at most."""
     turns, angles = np.arange(6) * np.pi / 3.0, np.radians([3.0, 10.0, 20.0])
     prism = np.array([(0.1 * np.cos(a), 0.1 * np.sin(a), z) for z in (-0.05, 0.05) for a in turns])
@@ -171,7 +171,7 @@ def test_a_hull_of_many_corners_rests_on_a_sloping_cell(dtype):
     for one, t in zip(q, angles, strict=True):
         one[:3] = np.array([0.1, 0.13, 0.1 * np.tan(t)]) + 0.0501 * np.array([-np.sin(t), 0.0, np.cos(t)])
         one[3:] = 0.0, -np.sin(0.5 * t), 0.0, np.cos(0.5 * t)
-    dyn = spo.Dynamics(scene, worlds=3, dtype=dtype, device="cpu")
+    dyn = spo.Dynamics(scene, worlds=3, dtype=dtype, device=device)
     qd = np.zeros((3, 6))
     for _ in range(60):
         q, qd = dyn.step(q, qd, dt=H)

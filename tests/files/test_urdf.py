@@ -12,7 +12,7 @@ import pytest
 import warp_spo as spo
 from benchmarks.robot_files import compare_urdf, short, urdf_files
 from warp_spo.newton import load
-from warp_spo.newton.files.inertia_repair import repaired
+from warp_spo.newton.files.inertia_repair import repair_body
 from warp_spo.reference.dense import Dense, homogeneous
 from warp_spo.viewing.appearance import file_appearance
 
@@ -269,6 +269,60 @@ def test_what_urdf_does_not_define_is_named_once(tmp_path):
         load(written(tmp_path, robot(*pair("revolute", LIMIT))))
 
 
+def test_elements_of_a_robot_that_urdf_does_not_define_are_named(tmp_path):
+    """A loop of another program, and links in an element of their own, are no part of the scene."""
+    known = "<material/><gazebo/><transmission/><sensor/><ros2_control/><mujoco/>"
+    loop = '<loop_joint name="closing"><link1 link="a"/><link2 link="b"/></loop_joint>'
+    group = f"<group>{LINK.format('lost')}</group>"
+    words = "left out, because URDF does not define it: <loop_joint> 'closing', <group>; correct the names"
+    with pytest.warns(UserWarning, match=words):
+        scene = load(written(tmp_path, robot(*pair("revolute", LIMIT), known, loop, group)))
+    assert scene.body_labels == ["r/a", "r/b"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load(written(tmp_path, robot(*pair("revolute", LIMIT), known)))
+
+
+WEIGHED = {
+    '<box size="-1 1 1"/>': r"line 1, <box>: size is \[-1.0, 1.0, 1.0\]; expected none below zero",
+    "<box/>": "line 1, <box>: no attribute 'size'; expected one; write it",
+    '<sphere radius="-1"/>': "line 1, <sphere>: radius is -1; expected 0 or more",
+    '<cylinder radius="1"/>': "line 1, <cylinder>: no attribute 'length'",
+    '<ellipsoid radius="1"/>': "line 1, <ellipsoid>: a shape that is not read; expected .*<box>.* write <inertial>",
+    "": "line 1, <geometry>: it holds nothing; expected one shape; write a <collision> for each",
+    '<sphere radius="1"/><box size="1 1 1"/>': "it holds <sphere>, <box>; expected one shape",
+}
+
+
+@pytest.mark.parametrize("shape", WEIGHED)
+def test_shapes_that_cannot_be_weighed_are_refused(shape, tmp_path):
+    """A link without a mass had that of a shape of another size, or zero, and a warning that its shapes weigh it."""
+    link = f'<link name="b"><collision><geometry>{shape}</geometry></collision></link>'
+    file = written(
+        tmp_path, f'<robot name="r">{LINK.format("a")}{link}{JOINT.format("j", "revolute", "a", "b", LIMIT)}</robot>'
+    )
+    with pytest.raises(ValueError, match=f"load: .*robot.urdf', .*{WEIGHED[shape]}"):
+        load(file)
+    assert not load(file, repair=False).values["body_mass"][0, 1]
+
+
+@pytest.mark.parametrize(
+    ("shape", "volume"),
+    [
+        ('<box size=".1 .2 .3"/>', 0.006),
+        ('<sphere radius=".1"/>', 4e-3 * np.pi / 3),
+        ('<cylinder radius=".1" length=".3"/>', 3e-3 * np.pi),
+        ('<capsule radius=".1" length=".3"/>', 3e-3 * np.pi + 4e-3 * np.pi / 3),
+        ('<capsule radius=".1" height=".3"/>', 3e-3 * np.pi + 4e-3 * np.pi / 3),
+    ],
+)
+def test_shapes_weigh_as_much_as_their_volume(shape, volume, tmp_path):
+    link = f'<link name="b"><collision><geometry>{shape}</geometry></collision></link>'
+    file = written(tmp_path, robot(LINK.format("a"), link, JOINT.format("j", "revolute", "a", "b", LIMIT)))
+    with pytest.warns(UserWarning, match="links 'b' move and have no mass"):
+        assert load(file).values["body_mass"][0, 1] == pytest.approx(1000 * volume, rel=1e-6)
+
+
 def test_a_mimic_of_no_joint_is_left_out_with_a_warning(tmp_path):
     path = written(tmp_path, robot(*pair("revolute", '<mimic joint="x"/>')))
     with pytest.warns(UserWarning, match="line 4: joint 'j' mimics 'x', which is no joint of the file"):
@@ -356,7 +410,7 @@ def test_inertias_are_replaced_by_newtons_rule(rng):
         body = builder.add_body()
         builder.body_mass[body], builder.body_inertia[body] = float(mass), inertia
     model = builder.finalize(device="cpu")
-    ours = [repaired(float(mass), inertia) for mass, inertia in zip(masses, inertias, strict=True)]
+    ours = [repair_body(float(mass), inertia) for mass, inertia in zip(masses, inertias, strict=True)]
     np.testing.assert_array_equal(model.body_mass.numpy(), [mass for mass, _ in ours])
     assert sum(not np.array_equal(new, old) for (_, new), old in zip(ours, inertias, strict=True)) > 100
     for (_, mine), theirs, given in zip(ours, model.body_inertia.numpy(), moments, strict=True):
@@ -398,8 +452,8 @@ def test_small_bodies_are_repaired_in_proportion():
     """Impossible inertias are replaced at every size, by the same share of the largest moment."""
     for moments in ([-1.0, 2.0, 2.0], [1.0, 1.0, 4.0], [0.0, 1.0, 1.0]):
         for scale in (1e-4, 1e-8, 1e-12):
-            _, inertia = repaired(scale, scale * np.diag(moments))
-            _, same = repaired(1.0, 1e-4 * np.diag(moments))
+            _, inertia = repair_body(scale, scale * np.diag(moments))
+            _, same = repair_body(1.0, 1e-4 * np.diag(moments))
             np.testing.assert_allclose(inertia / scale, same / 1e-4, rtol=1e-9)
             low, middle, high = np.linalg.eigvalsh(inertia)
             assert low > 0.0 and low + middle >= high

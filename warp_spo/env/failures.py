@@ -1,4 +1,4 @@
-"""What is kept of worlds that fail: a ring of their last states on the device, and a thread that writes files.
+"""Records of worlds that fail: a ring of their last states on the device, and a thread that writes files.
 
 A world fails where the guard ends it, or where a step of the dynamics gives it a status from CONTACT on by severity.
 The device copies the ring of such a world aside within the step; the host learns of it by a number that the device
@@ -204,7 +204,7 @@ class FailureRing:
         own, threads = self._wp, kernels.THREADS if self._device.type == "cuda" else 1
         ring = [SLOTS, self._words, self._ring.data_ptr(), own["place"], own["pitch"]]
         failed = [own["fault"], own["status"], len(self._guard), self._counted, FILES_OF_A_CAUSE]
-        written = [own[name] for name in ("taken", "until", "latest", "first", "clock", "files", "chosen", "rows")]
+        written: list[Any] = [own[name] for name in ("taken", "until", "latest", "first", "clock", "files", "chosen", "rows")]
         written.append(self._told.data_ptr())
         self._launch(kernels.find_failures(), threads, [threads, *ring, *failed], written, threads)
 

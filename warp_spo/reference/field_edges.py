@@ -53,21 +53,38 @@ def points(field, cell, centre, axes, reach, slack, faces, sides, round_by=np.in
     """
     ranges = [between(centre[f] - reach[f], centre[f] + reach[f], cell[f], field.shape[f]) for f in (0, 1)]
     found, looks = [], [normal @ axes[:, 2] <= -DOWN for normal, _ in faces]
+    steep = [-DOWN < normal @ axes[:, 2] <= -LOW for normal, _ in faces]
     for i in range(ranges[0][0], ranges[0][1] + 1):
         for j in range(ranges[1][0], ranges[1][1] + 1):
             q = axes @ (np.array([i * cell[0], j * cell[1], field[i, j]]) - centre)
-            inside = [offset - normal @ q for normal, offset in faces]
-            down = [depth if look else np.inf for depth, look in zip(inside, looks, strict=True)]
-            best = int(np.argmin(down))
-            out, depth = faces[best][0], down[best]
+            inside = np.array([offset - normal @ q for normal, offset in faces])
+            best, aside = (int(np.where(which, inside, np.inf).argmin()) for which in (looks, steep))
+            depth = inside[best] if looks[best] else np.inf
+            if steep[aside] and inside[aside] < depth and is_top(field, cell, i, j, -axes.T @ faces[aside][0]):
+                best, depth = aside, inside[aside]
+            out = faces[best][0]
             side = min(
-                (x for x, look, (n, _) in zip(inside, looks, faces, strict=True) if not look and n @ out > -DOWN),
+                (
+                    x
+                    for n, (x, look, (normal, _)) in enumerate(zip(inside, looks, faces, strict=True))
+                    if n != best and not look and normal @ out > -DOWN
+                ),
                 default=np.inf,
             )
             side = min(side, round_by - np.sqrt(q[0] * q[0] + q[1] * q[1]))
             if np.isfinite(depth) and side >= 0.0 and depth <= side + slack:
                 found.append((depth, *sides(q), [POINT, i, j, *out, *(faces[best][1] * out)]))
     return found
+
+
+def is_top(field, cell, i, j, n):
+    """Return whether the field falls away along its lines from a plane with the normal ``n`` at a grid point."""
+    for f, (along, across) in enumerate(((i, j), (j, i))):
+        m = min(across, field.shape[1 - f] - 2)
+        before, after = (_slope_beside(field, cell, along + beside, m, across - m, f) for beside in (-1, 0))
+        if not before * n[2] >= -n[f] >= after * n[2]:
+            return False
+    return True
 
 
 def looks_down(axes, both, least):

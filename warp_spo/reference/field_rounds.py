@@ -6,7 +6,6 @@ from .field_cells import over_cell, twist_of
 from .field_edges import (
     BENT,
     BESIDE,
-    DOWN,
     INSIDE,
     LINE_X,
     LINE_Y,
@@ -46,7 +45,7 @@ def cylinder(field, cell, centre, axes, sizes, table):
         for t, away, distance, row in beside:
             q = axes @ -away
             found.append((radius - distance, *sides(np.array([*q[:2], t])), row))
-    if abs(lean) >= DOWN:
+    if abs(lean) >= LOW:
         face = (np.array([0.0, 0.0, end]), half)
         reach = np.abs(axes.T) @ sizes
         found += points(field, cell, centre, axes, reach, 0.0 if leans else slack, [face], sides, radius)

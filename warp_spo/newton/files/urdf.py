@@ -24,7 +24,7 @@ from ..worlds import quote_labels
 from .inertia_repair import repair_bodies
 from .urdf_masses import mass_of_shapes
 from .urdf_mimics import SCALAR, read_mimics
-from .urdf_shapes import urdf_pairs, urdf_shapes
+from .urdf_shapes import check_for_mass, urdf_pairs, urdf_shapes
 from .urdf_unknown import warn_of_unknown
 from .urdf_up_axis import turn_meshes
 from .xml_source import XmlElement, read_xml
@@ -79,7 +79,7 @@ def read_urdf(file: Path, floating: bool | None, repair: bool, selection: ShapeS
     couplings, held = read_mimics(carried)
     hinges = [base, *(_hinge(joint, number, label, held.get(index)) for index, joint in enumerate(carried))]
     _warn_of_limits(carried, held)
-    warn_of_unknown(file, [*carried, *links.values()])
+    warn_of_unknown(file, robot, [*carried, *links.values()])
     inertials = _inertials([links[link] for link in number], hinges, repair)
     masses, inertias = [i[0] for i in inertials], [i[2] for i in inertials]
     try:
@@ -200,7 +200,7 @@ def _hinge(joint: XmlElement, number: dict[str, int], label: Callable[[str], str
         values |= _limits(joint, kind)
     position, turn = origin_of(joint)
     if held is not None:
-        position, turn = _moved(position, turn, kind, _axis(joint), held)
+        position, turn = _move_child(position, turn, kind, _axis(joint), held)
         kind, values = "fixed", {}
     pose = np.concatenate([position, turn])
     try:
@@ -225,7 +225,7 @@ def origin_of(holder: XmlElement) -> tuple[np.ndarray, np.ndarray]:
     return origin.numbers("xyz", 3, (0.0, 0.0, 0.0)), np.array(quaternion)
 
 
-def _moved(
+def _move_child(
     position: np.ndarray, turn: np.ndarray, kind: str, axis: np.ndarray, q: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the position and the unit quaternion of a joint's child where the joint's coordinate is ``q``."""
@@ -350,6 +350,8 @@ def _inertials(links: list[XmlElement], hinges: list[Hinge], repair: bool) -> li
         if not repair or weights[group[index]] != 0.0 or not shapes or link.find("inertial") is not None:
             continue
         if moves or link.find("collision//mesh") is None:
+            if moves:
+                check_for_mass(link)
             inertials[index] = mass_of_shapes(link)
             weighed += [link] * moves
     if weighed:
