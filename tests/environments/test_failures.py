@@ -16,6 +16,7 @@ from warp_spo import train as command  # noqa: E402
 from warp_spo.env import Env, Observation, TorchTerm, actions, commands, events, failures, training_files  # noqa: E402
 from warp_spo.env.failure_replay import read  # noqa: E402
 from warp_spo.env.learning import Learner, train  # noqa: E402
+from warp_spo.execution.status_words import words_of_states  # noqa: E402
 
 WORLDS = 12
 PLANTED, THROWN, POLICY = (7, 53), (9, 56), (3, 60)  # world and step
@@ -263,6 +264,25 @@ def test_files_that_are_none_or_do_not_fit(run, tmp_path):
     )
     with pytest.raises(ValueError, match=words):
         cart_env(2).replay_failure(files[POLICY[0]])
+
+
+def test_words_of_files_are_those_of_a_step_that_checks_its_state():
+    """Steps of environments leave checks of q to the guard; files say of q what the check of a step says."""
+    scene = spo.Scene(
+        [spo.Body(1.0, inertia=np.eye(3)), spo.Body(1.0, inertia=np.eye(3))],
+        [spo.Hinge("free", -1, 0), spo.Hinge("revolute", 0, 1, axis=(0, 1, 0))],
+    )
+    q = np.tile(scene.neutral_q.astype(np.float32), (6, 1))
+    q[0, 3:7], q[1, 3:7], q[2, 7], q[3, 0], q[4, 3:7] = 0.0, 1e-17, 3e10, math.nan, 1e25
+    words = {}
+    for checks in (True, False):
+        dyn, status = spo.Dynamics(scene, 6, "cpu", "float32"), np.zeros(6, np.int32)
+        dyn._checks_results = checks
+        dyn.step(q, np.zeros((6, scene.dof_count), np.float32), dt=1e-3, status=status)
+        words[checks] = status
+    assert [spo.Status(word).name for word in words[True][:4]] == ["QUATERNION", "RANGE", "RANGE", "NOT_FINITE"]
+    assert (words[False] != words[True]).any()
+    np.testing.assert_array_equal(words_of_states(scene, q, words[False]), words[True])
 
 
 def test_a_scene_that_cannot_be_pickled_leaves_states(tmp_path, monkeypatch):

@@ -290,6 +290,18 @@ def test_flexible_bodies_bend_to_the_bodies_that_they_carry():
         page.close()
 
 
+def test_the_camera_sees_the_whole_of_a_flexible_body():
+    """A beam of a metre, drawn as a line alone, which the first picture left to the right."""
+    from warp_spo.examples import spinning_beam
+
+    page = view(spinning_beam.scene(), port=18080)
+    try:
+        assert 0.95 < page.size < 1.1  # mass points are at middles of slices
+        assert not page.layers["what the file draws"].handles
+    finally:
+        page.close()
+
+
 def test_two_pages_take_two_ports_of_this_machine(leg):
     _, page = leg
     other = view(spo.load(shipped("cartpole")), port=page.page.server.get_port())

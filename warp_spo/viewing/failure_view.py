@@ -46,7 +46,7 @@ class FailureView:
         self._poses = Dynamics(still, failure.steps, "cpu", "float64").body_poses(q.astype(np.float64))
         self.poses = self._poses[0]
         self.appearance = scene_appearance(self.scene, q[0]) if appearance is None else appearance
-        low, high = extent(self.appearance, self.poses)
+        low, high = extent(self.appearance, self.poses, self.scene)
         self.size = max(float(np.linalg.norm(high - low)), 0.05)
         self.page = Page(f"world {failure.world}", host, port, self.size)
         followed = np.array([*self.poses[0, :2], 0.0]) if floats(self.scene) else 0.0

@@ -59,7 +59,7 @@ class PolicyView:
         self.appearance = scene_appearance(env.scene, env.default_q) if appearance is None else appearance
         self.observed, _ = env.reset()
         poses = self._all_poses()[0]
-        low, high = extent(self.appearance, poses)
+        low, high = extent(self.appearance, poses, env.scene)
         self.size = max(float(np.linalg.norm(high - low)), 0.05)
         self.page = Page(title, host, port, self.size)
         middle = 0.5 * (low + high) - [*poses[0, :2], 0.0]  # the page follows the first body

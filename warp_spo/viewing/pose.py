@@ -45,13 +45,12 @@ def closed_pose(dyn: Dynamics, q: np.ndarray) -> np.ndarray:
     return q
 
 
-def extent(appearance: Appearance, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and the highest corner of the box about what is drawn of the bodies [m]."""
-    found = [
-        surface.vertices @ rotation(poses[surface.body, 3:]).T + poses[surface.body, :3]
-        for surface in appearance.drawn
-        if surface.body >= 0 and len(surface.vertices)
-    ]
+def extent(appearance: Appearance, poses: np.ndarray, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and the highest corner of the box about what is drawn of the bodies, unbent ones [m]."""
+    places = [(each.body, each.vertices) for each in appearance.drawn if each.body >= 0 and len(each.vertices)]
+    bent = [(body, part.modes) for body, part in enumerate(scene.bodies) if part.modes is not None]
+    places += [(body, modes.points.position) for body, modes in bent if modes.points is not None]
+    found = [some @ rotation(poses[body, 3:]).T + poses[body, :3] for body, some in places]
     corners = np.concatenate([*found, poses[:, :3]])
     return corners.min(axis=0), corners.max(axis=0)
 

@@ -61,11 +61,11 @@ class RobotView:
         if self._kinematics.closed:
             self.q = closed_pose(self._kinematics, self.q)
         self.poses = self._kinematics.body_poses(self.q[None])[0]
-        low, high = extent(appearance, self.poses)
+        low, high = extent(appearance, self.poses, scene)
         if floats(scene) and not scene.keyframes and np.array_equal(scene.initial_q, scene.neutral_q):
             self.q[2] -= low[2]  # stands on the ground
             self.poses = self._kinematics.body_poses(self.q[None])[0]
-            low, high = extent(appearance, self.poses)
+            low, high = extent(appearance, self.poses, scene)
         self.size = max(float(np.linalg.norm(high - low)), 0.05)
         ground = scene.ground if scene.ground is not None else Plane()
         if not own_ground:
@@ -82,8 +82,10 @@ class RobotView:
         self.falls, self._steps_due, self._time_due = False, 0, 0.0
         self._pull: Pull | None = None
         self._grip: Any = None
+        bent = {i for i, body in enumerate(scene.bodies) if body.modes is not None and body.modes.points is not None}
+        drawn = [each for each in appearance.drawn if each.body not in bent]  # a straight bone would hide the bent line
         self.layers = {
-            "what the file draws": BodyLayer(self.page, "drawn", appearance.drawn, clicked=self._click),
+            "what the file draws": BodyLayer(self.page, "drawn", drawn, clicked=self._click),
             "collision shapes": BodyLayer(self.page, "collision", appearance.collision, opacity=0.5, visible=False),
         }
         self.overlays = Overlays(self.page, scene, self.size)
@@ -355,9 +357,7 @@ def view(robot: Any, host: str = HOST, port: int = PORT, contacts: Any = None, *
     load_viser()
     if isinstance(robot, Scene):
         look = scene_appearance(robot)
-        points = [body.modes is not None and body.modes.points is not None for body in robot.bodies]
-        bones = [each for each in look.drawn if not points[each.body]]  # a straight bone would hide the bent line
-        return RobotView(robot, look._replace(drawn=bones), "scene", host=host, port=port)
+        return RobotView(robot, look, "scene", host=host, port=port)
     if isinstance(robot, str | Path):
         file = Path(robot)
         scene, notes, has_ground = load_with_notes(file, contacts, options)

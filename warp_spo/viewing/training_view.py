@@ -51,7 +51,7 @@ class TrainingView:
         still = scene.with_contacts([]).without_loops()
         self._dyn = Dynamics(still, copies.worlds, "cpu", "float32")
         self.poses = self._dyn.body_poses(np.tile(np.asarray(q, np.float32), (copies.worlds, 1)))
-        low, high = extent(self.appearance, self.poses[0].astype(np.float64))
+        low, high = extent(self.appearance, self.poses[0].astype(np.float64), scene)
         size = max(float(np.linalg.norm(high - low)), 0.05)
         columns = math.ceil(math.sqrt(copies.worlds))
         self.page = Page(title, host, port, size * (1.0 if isinstance(scene.ground, HeightField) else columns))
