@@ -157,6 +157,9 @@ def test_frames_in_resets_and_commands_are_those_of_the_state_that_starts():
     observed, _, done, _ = env.step(torch.ones(4, 1))
     assert done.tolist() == [0, 1, 0, 0]
     check(observed, [1])
+    mounts = events.randomise("joint_X_p", [(0.0, 0.1)] * 3 + [(0.0, 0.0)] * 4, "add", when="reset")
+    with pytest.raises(ValueError, match=r"World.frame: .* reads 'pole' where an episode starts; .* joint_X_p"):
+        cart_env(1, events=[events.Reset(place), mounts])
 
 
 def test_phases_are_counted_in_whole_steps():

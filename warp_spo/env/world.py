@@ -454,8 +454,8 @@ class World:
         """Set numbers of :meth:`memory`; a reset sets those without a :meth:`memory` call to zero.
 
         What :class:`events.Start` and :class:`events.Reset` keep stays. Numbers that no reset changes stay as they were
-        where new ones are not finite. A term that is a reward and an observation,
-        too, keeps twice in a step; :meth:`sensor` does so once.
+        where new ones are not finite. A term that is a reward and an observation, too, keeps twice in a step;
+        :meth:`sensor` does so once.
 
         Raises:
             ValueError: the environment itself remembers something under this name, such as "action".
