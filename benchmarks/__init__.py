@@ -18,9 +18,10 @@ Contact:
     ``contact/``: times and errors, energy, every promised figure, other engines, gradients, terrain.
 Learning:
     ``env_times`` (parts of a step of an environment), ``actuator_nets`` (what learned actuators cost), ``training``
-    (env-steps/s), ``learner`` (ways to learn, as graphs and not), ``learning_curves``, ``watched_training`` (the price
-    of a page, at which ``page_client`` looks, and of keeping failures), ``mdp/`` (do the ready tasks compute what their
-    pages say?), ``guard`` (trainings with numbers that are spoilt), ``failures`` (their cost and the bits of replays),
+    (env-steps/s), ``learner`` (ways to learn, as graphs and not), ``threshold_times`` (from the command to a policy
+    that does what is asked for), ``learning_curves``, ``watched_training`` (the price of a page, at which
+    ``page_client`` looks, and of keeping failures), ``mdp/`` (do the ready tasks compute what their pages say?),
+    ``guard`` (trainings with numbers that are spoilt), ``failures`` (their cost and the bits of replays),
     ``killed_trainings`` (``kill -9`` and ``--resume latest``; a CPU), ``installed_tasks`` (a package with tasks, by
     pip; a CPU), ``page_times`` (frames and the first picture of a page; a CPU).
 Documentation and refactoring:

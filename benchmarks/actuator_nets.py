@@ -1,6 +1,6 @@
 """Cost of learned actuators in a step of ``go2-flat``, and their torques beside those of torch.
 
-    python -m benchmarks.actuator_nets [--worlds 4096] [--device cuda:0] [--json FILE]
+    python -m benchmarks.actuator_nets [--worlds 4096] [--ways network ...] [--device cuda:0] [--json FILE]
 
 ``servos``: the task as it is. ``network``: three layers of 32 units for twelve joints, errors and rates now and two and
 four substeps ago. The other rows are other ways to compute the same torques, see WAYS. All are graphs of a whole step,
@@ -38,6 +38,8 @@ WAYS: dict[str, dict[str, Any]] = {
     "network": {},
     "kernels apart": {"JOINED_ON": ()},
     "products in float32": {"TENSOR_CORES": False},
+    "layers in a loop": {"LOOPS": True},
+    "a tile at a time": {"TILES": 1},
     "without helpers": {"MOST_TEAM": 0},
     "a reciprocal each": {"PAIRS": False},
 }
@@ -130,9 +132,16 @@ def show(found: dict[str, Any]) -> None:
 def main(arguments: list[str] | None = None) -> int:
     parser = command_line.parser("actuator_nets", __doc__)
     parser.add_argument("--worlds", type=int, default=4096)
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS), metavar="ROW", help="rows, in quotes")
+    parser.add_argument("--compile", action="store_true", help="compile their kernels and end")
     options = parser.parse_args(arguments)
     device = learning.pick_device(options.device)
     whole = network((6, 32, 32, 32, 1), (0, 2, 4))
+    ways = {name: changes for name, changes in WAYS.items() if name in ("network", *options.ways)}
+    if options.compile:
+        for name in options.ways:
+            build_way(options.worlds, device, whole, WAYS[name])
+        return 0
     found: dict[str, Any] = {
         "error of torques": compare(device, whole, {}),
         "error of torques in float32": compare(device, whole, {"TENSOR_CORES": False}),
@@ -142,7 +151,7 @@ def main(arguments: list[str] | None = None) -> int:
         found[f"bits: {name}"] = "equal" if bits(build_way(worlds, device, whole, changes)).equal(first) else "other"
     show(found)
     made = {"servos": build(options.worlds, device, None)}
-    made |= {name: build_way(options.worlds, device, whole, changes) for name, changes in WAYS.items()}
+    made |= {name: build_way(options.worlds, device, whole, changes) for name, changes in ways.items()}
     for env in made.values():
         assert env_times.drive(env, env_times.DRIVEN), "observations that are not finite"
     turns = [{name: env_times.time_of(env.replay, device) for name, env in made.items()} for _ in range(TURNS)]
@@ -151,7 +160,7 @@ def main(arguments: list[str] | None = None) -> int:
         found[f"dynamics, {name}"] = env_times.time_of(env_times.as_graph(made[name]._physics, device), device)
     products = sum(w.size for w in whole.weights)
     found["bound of the kernels"] = 4 * options.worlds * 12 * 2 * products / PEAK
-    found |= {f"{name} over servos": found[name] / found["servos"] for name in WAYS}
+    found |= {f"{name} over servos": found[name] / found["servos"] for name in ways}
     found["device"] = torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else "cpu"
     show(found)
     error = found["error of torques"]

@@ -1,12 +1,11 @@
 """Time of an iteration of training by ways to learn; whether graphs of rollouts and updates compute what calls do.
 
     python -m benchmarks.learner --json benchmarks/results/training/LEARNER.json [--worlds 4096 16384]
-                                 [--variants stock graphs ...] [--kernels] [--train tf32 bfloat16]
+                                 [--variants stock graphs ...] [--kernels]
 
 ``collect`` and ``learn`` are medians over iterations in ms of wall time, ``iteration`` the whole with the log's rows,
-``busy`` the time in which a kernel of the GPU was at work, ``kernels`` their number. --kernels lists those that take
-longest. A variant that fails has the error in place of times. --train: seconds from the command, with an empty kernel
-cache, to the first checkpoint that walks as ASKED; kernels of the measure itself are compiled apart.
+``busy`` the time in which a kernel was at work, ``kernels`` their number. --kernels lists those of rollouts and of
+updates that take longest. A variant that fails has the error in place of times.
 """
 
 from __future__ import annotations
@@ -18,9 +17,7 @@ import gc
 import io
 import itertools
 import json
-import os
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -38,16 +35,13 @@ from warp_spo import env as envs
 from warp_spo.env import learning
 from warp_spo.env.captured_ppo import CapturedPPO
 from warp_spo.env.compile.cuda_graphs import Captured
-from warp_spo.env.startup import PRECISIONS
 from warp_spo.env.tasks import task
-from warp_spo.env.training_log import read_rows
 
 from . import command_line
 
 WARM, ITERATIONS, PROFILED = 4, 12, 3
 LISTED = 25  # kernels
 ROUNDED = 1e-4  # of numbers of a rollout, whose returns another kernel sums
-ASKED = {"velocity error": 0.2, "turning error": 0.2, "falls": 0.03}  # [m/s], [rad/s], share
 NEAR = 1e-3  # of the way that weights went: rounding in TF32 may differ where a library picks other kernels for a graph
 CLOSE = 2e-2  # the same, of one update by other kernels: Adam's first steps have the sign of gradients near zero
 
@@ -155,11 +149,15 @@ def measure(env: Any, variant: Variant) -> dict[str, Any]:
             "bytes": torch.cuda.max_memory_allocated(env.device) - before,
         }
         found |= profile(lambda: learn(runner, PROFILED))
+        if not variant.stepwise:
+            alg, repeat = runner.alg, range(PROFILED)
+            found["rollout"] = profile(lambda: [alg.collect(env, alg._seen) for _ in repeat])
+            found["update"] = profile(lambda: [alg.update() for _ in repeat])
     steps = env.num_envs * runner.cfg["num_steps_per_env"]
     return found | {"env-steps/s": 1e3 * steps / found["iteration"]}
 
 
-def profile(work: Callable[[], None]) -> dict[str, Any]:
+def profile(work: Callable[[], Any]) -> dict[str, Any]:
     """Return ms in which kernels were at work, and their number, a call of an iteration; and the longest of them."""
     activities = [torch.profiler.ProfilerActivity.CUDA]
     with torch.profiler.profile(activities=activities) as profiler:
@@ -225,47 +223,6 @@ def weights_of(alg: Any) -> torch.Tensor:
     return torch.cat([w.detach().flatten() for model in (alg.actor, alg.critic) for w in model.parameters()])
 
 
-def train(device: str, precision: str, every: int = 20) -> dict[str, Any]:
-    """Train go2-flat by the command with an empty kernel cache; return when its checkpoints first walk as asked [s]."""
-    with tempfile.TemporaryDirectory() as folder:
-        own = {**os.environ, "WARP_CACHE_PATH": f"{folder}/cache"}
-        command = [
-            sys.executable,
-            "-m",
-            "warp_spo.train",
-            "go2-flat",
-            "--device",
-            device,
-            "--profile-start",
-            "--logger",
-        ]
-        command += ["none", "--precision", precision, "--save-interval", str(every), "--out", f"{folder}/run"]
-        began = time.time()
-        done = subprocess.run(command, env=own, capture_output=True, text=True)
-        wall = time.time() - began
-        lines = done.stdout.splitlines()
-        found: dict[str, Any] = {"wall": wall, "start": [line.strip() for line in lines if " s  " in line[:14]]}
-        if done.returncode:
-            return found | {"error": done.stderr[-2000:]}
-        again = [*command[:-1], f"{folder}/again", "--iterations", "1"]
-        warm = subprocess.run(again, env=own, capture_output=True, text=True)
-        found["start, warm"] = [line.strip() for line in warm.stdout.splitlines() if " s  " in line[:14]]
-        rows = read_rows(Path(folder) / "run" / "progress.jsonl")
-        found["reward of the last 20"] = statistics.mean(row["reward"] for row in rows[-20:])
-        found["warnings"] = [line for line in done.stderr.splitlines() if "Warning: train" in line]
-        chosen = task("go2-flat")
-        env = chosen.build(256, device, 1)
-        runner = learning.make_runner(env, chosen.LEARNER)
-        for iteration in range(3 * every, len(rows), every):
-            learning.load_checkpoint(runner, Path(folder) / "run" / f"model_{iteration}.pt", learns=False)
-            figures = chosen.measure(env, learning.policy_of(runner))
-            errors = {name: figures[name] for name in ASKED}
-            found[f"iteration {iteration}"] = errors | {"seconds": rows[iteration]["seconds"]}
-            if all(errors[name] <= limit for name, limit in ASKED.items()):
-                return found | {"seconds to walk": rows[iteration]["seconds"]}
-        return found
-
-
 def recover(device: str) -> dict[str, Any]:
     """Return whether a function that cannot be captured is called instead, and random numbers can be drawn after it."""
     numbers = torch.zeros(1, device=device)
@@ -296,7 +253,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser = command_line.parser("learner", __doc__)
     parser.add_argument("--worlds", type=int, nargs="+", default=[4096, 16384])
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
-    parser.add_argument("--train", nargs="+", choices=PRECISIONS, default=[], help="also train go2-flat by the command")
     parser.add_argument("--kernels", action="store_true", help="print the kernels that take longest")
     options = parser.parse_args(arguments)
     device = learning.pick_device(options.device)
@@ -325,15 +281,14 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"{name + f', {worlds}':32}{found['collect']:9.2f}{found['learn']:9.2f}{found['iteration']:11.2f}"
                   f"{found['busy']:9.2f}{found['kernels']:9.0f}{found['bytes'] / 1e9:7.2f}"
                   f"{found[f'first {WARM} iterations']:9.0f}", flush=True)  # fmt: skip
-            for kernel, (ms, count) in found["longest [ms, number]"].items() if options.kernels else ():
-                print(f"    {ms:8.3f} ms {count:7.0f}  {kernel}")
+            for part in ("rollout", "update") if options.kernels and "rollout" in found else ():
+                print(f"  {part}: busy {found[part]['busy']:.2f} ms, {found[part]['kernels']:.0f} kernels")
+                for kernel, (ms, count) in found[part]["longest [ms, number]"].items():
+                    print(f"    {ms:8.3f} ms {count:7.0f}  {kernel}")
             if options.json:
                 options.json.write_text(json.dumps(results, indent=1))
     results["a failed capture, check"] = found = attempt(lambda: recover(device))
     print(f"a failed capture, check: {json.dumps(found)}", flush=True)
-    for precision in options.train:
-        results[f"train, {precision}"] = found = attempt(lambda: train(device, precision))  # noqa: B023
-        print(f"train, {precision}: {json.dumps(found, indent=1)}", flush=True)
     if options.json:
         options.json.write_text(json.dumps(results, indent=1))
     rows = [row for row in results.values() if isinstance(row, dict)]

@@ -1,11 +1,12 @@
-"""By how much an iteration is longer with a page, while somebody looks at it, and with ``keep_failures``.
+"""By how much an iteration is longer with a page, while somebody looks at it, with ``keep_failures``, with TensorBoard.
 
     python -m benchmarks.watched_training --device cuda:0 --json watched.json       # ends after 2.5 minutes
+    python -m benchmarks.watched_training --device cuda:0 --states TensorBoard
 
-Four states take turns: a training as it is, one with ``--view`` at which nobody looks, one that a reader in another
-process looks at (see ``page_client``), and one whose environment keeps failures. A turn is some iterations; its ratio
-is that of its time to that of the first state in the same round, and the median over the rounds is compared with the
-limits: 0.5 %, 3 % and 2 %.
+States take turns: a training as it is, one with ``--view`` at which nobody looks, one that a reader in another
+process looks at (see ``page_client``), one whose environment keeps failures, and one that TensorBoard logs. A turn is
+some iterations; its ratio is that of its time to that of the first state in the same round, and the median over the
+rounds is compared with the limits: 0.5 %, 3 %, 2 % and 1 %.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from warp_spo.env import learning
+from warp_spo.env import learning, loggers
 from warp_spo.env.state_copies import StateCopies
 from warp_spo.env.task_files import robot_file
 from warp_spo.env.tasks import task
@@ -31,7 +32,8 @@ from warp_spo.viewing.training_view import TrainingView
 from .page_client import looking
 
 PLAIN, PAGE, WATCHED, KEPT = "plain", "page, nobody looks", "page, somebody looks", "keep_failures"
-LIMITS = {PAGE: 0.005, WATCHED: 0.03, KEPT: 0.02}  # by how much an iteration may be longer
+LOGGED = "TensorBoard"
+LIMITS = {PAGE: 0.005, WATCHED: 0.03, KEPT: 0.02, LOGGED: 0.01}  # by how much an iteration may be longer
 
 
 class Training:
@@ -75,6 +77,28 @@ class Training:
             self.runner.watchers.remove(copies.copy)
             view.close()
 
+    @contextlib.contextmanager
+    def logger(self) -> Any:
+        """Log to TensorBoard, too, inside; a context manager."""
+        log: Any = self.runner.logger
+        log._open = {LOGGED: loggers.start("tensorboard", self.rows.parent, 0, {})}
+        try:
+            yield
+        finally:
+            log.close()
+
+
+def _watch(training: Training, copies: StateCopies, times: dict[str, list[float]], iterations: int) -> None:
+    """Time a training with a page, at which nobody looks and then somebody does, as far as ``times`` has these."""
+    with training.page(copies) as page:
+        before = copies.count
+        if PAGE in times:
+            times[PAGE].append(training.learn(iterations))
+            assert copies.count == before, "states were copied while nobody looked"
+        if WATCHED in times:
+            with looking(page):
+                times[WATCHED].append(training.learn(iterations))
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure, print a table, and return 1 where a limit is passed."""
@@ -85,33 +109,37 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--iterations", type=int, default=20, help="of a turn")
     parser.add_argument("--rounds", type=int, default=15, help="at most")
     parser.add_argument("--seconds", type=float, default=150.0, help="after which no round begins")
+    parser.add_argument("--states", nargs="+", choices=LIMITS, default=list(LIMITS), metavar="STATE")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     began, chosen = time.monotonic(), task(options.task)
-    times: dict[str, list[float]] = {PLAIN: [], PAGE: [], WATCHED: [], KEPT: []}
+    states = [state for state in LIMITS if state in options.states]
+    times: dict[str, list[float]] = {state: [] for state in (PLAIN, *states)}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         plain = Training(chosen, options, folder / "plain")
-        kept = Training(chosen, options, folder / "kept", keep_failures=folder / "failures")
-        print(kept.env._failures.describe(), flush=True)
+        kept = None
+        if KEPT in states:
+            kept = Training(chosen, options, folder / "kept", keep_failures=folder / "failures")
+            print(kept.env._failures.describe(), flush=True)
         copies = StateCopies(plain.env)
-        for each in (plain, kept):
+        for each in filter(None, (plain, kept)):
             each.learn(options.iterations)  # compiles and warms up
         print(f"begins after {time.monotonic() - began:.0f} s", flush=True)
         for number in range(options.rounds):
             if number and time.monotonic() - began > options.seconds:
                 break
             times[PLAIN].append(plain.learn(options.iterations))
-            with plain.page(copies) as page:
-                before = copies.count
-                times[PAGE].append(plain.learn(options.iterations))
-                assert copies.count == before, "states were copied while nobody looked"
-                with looking(page):
-                    times[WATCHED].append(plain.learn(options.iterations))
-            times[KEPT].append(kept.learn(options.iterations))
-        files = len(kept.env.failure_files())
+            if PAGE in states or WATCHED in states:
+                _watch(plain, copies, times, options.iterations)
+            if LOGGED in states:
+                with plain.logger():
+                    times[LOGGED].append(plain.learn(options.iterations))
+            if kept is not None:
+                times[KEPT].append(kept.learn(options.iterations))
+        files, ring = (0, 0) if kept is None else (len(kept.env.failure_files()), kept.env._failures.bytes)
     ratios = {
-        state: [row / base - 1.0 for row, base in zip(times[state], times[PLAIN], strict=True)] for state in LIMITS
+        state: [row / base - 1.0 for row, base in zip(times[state], times[PLAIN], strict=True)] for state in states
     }
     longer = {state: statistics.median(rows) for state, rows in ratios.items()}
     for state, rows in times.items():
@@ -123,9 +151,9 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"{len(times[PLAIN])} rounds of {options.iterations} iterations, {copies.count} copies, {files} failures")
     if options.json:
         row = {"task": options.task, "worlds": options.worlds, "device": options.device, "seconds": times,
-               "longer": longer, "copies": copies.count, "ring_bytes": kept.env._failures.bytes}  # fmt: skip
+               "longer": longer, "copies": copies.count, "ring_bytes": ring}  # fmt: skip
         options.json.write_text(json.dumps(row, indent=1) + "\n")
-    return int(any(longer[state] > limit for state, limit in LIMITS.items()))
+    return int(any(longer[state] > LIMITS[state] for state in states))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from .elementary import C_TYPE
 from .elementary import NATIVE as ELEMENTARY
 from .long_results import WARP_SIZE
 from .shared_rows import pitch
-from .substeps import SUBSTEPS, Before
+from .substeps import SUBSTEPS, WAIT, Before
 
 ACTIVATIONS = {
     "identity": "x",
@@ -195,10 +195,10 @@ def torques(joints: Joints, force_entries: int, block: int) -> wp.Kernel:
             *(f"staged[{k * tensor_networks.PITCH} + lane] = {x};" for k, x in enumerate(inputs)),
             *(f"staged[{k * tensor_networks.PITCH} + lane] = 0.0f;" for k in range(len(inputs), half.rows)),
             "__syncwarp();",
-            "float low[2], high[2];",
-            "network::tile(staged, weights.data, low);",
-            "network::tile(staged + 16, weights.data, high);",
-            "const float own = t == 0 ? low[0] : t == 1 ? low[1] : t == 2 ? high[0] : high[1];  // row 8 t + lane / 4",
+            "float sums[4];",
+            "network::tiles(staged, weights.data, sums);",
+            *(["network::tiles(staged + 16, weights.data, sums + 2);"] if tensor_networks.TILES == 1 else []),
+            f"const float own = {_chosen('t')};  // row 8 t + lane / 4",
             "const float found = __shfl_sync(0xffffffffu, own, 4 * (lane & 7) + (lane >> 3));",
         ]
     text += [*joints.limited("found"), f"if (keeps) tau.data[world * {qd_size} + dof] = torque;"]
@@ -244,7 +244,7 @@ def before_substep(joints: Joints, number: int) -> Before:
             f"const int age = {age} + substep;",
             "const bool keeps = mine;",
             "#pragma unroll 1",
-            f"for (int joint = warp; joint < {count}; joint += everyone) {{",
+            f"for (int joint = worker; joint < {count}; joint += workers) {{",
             *whole,
             "tau_row[dof] = torque;",
             f"if (keeps && {ends}) {write}",
@@ -254,16 +254,12 @@ def before_substep(joints: Joints, number: int) -> Before:
     size, pitched = joints.half.staged, tensor_networks.PITCH
     inputs = list(enumerate(joints.inputs()))
     held = "own[{} + joint * 96 + {} + lane]".format
-    gathered = [  # warps without other work gather, if there are any
-        f"for (int turn = 0; turn < ({count} + gatherers - 1) / gatherers; ++turn) {{",
-        "const int joint = gatherer + gatherers * turn;",
-        f"if (gatherer < 0 || joint >= {count}) break;",
+    gathered = [
+        f"for (int turn = 0; turn < ({count} + workers - 1) / workers; ++turn) {{",
+        "const int joint = worker + workers * turn;",
+        f"if (joint >= {count}) break;",
         f"float* staged = own + joint * {size} + lane;",
         *joints.places(suffix),
-    ]
-    head += [
-        "constexpr int gatherers = helpers ? helpers : everyone;",
-        "const int gatherer = warp - (everyone - gatherers);",
     ]
     start = [
         *head,
@@ -293,25 +289,40 @@ def before_substep(joints: Joints, number: int) -> Before:
         *_block("!helpers && mine", [f"const int age = {age} + substep;", *joints.keep(suffix)]),
         *(f"staged[{k * pitched}] = {x};" for k, (lag, x) in inputs if not lag),
         "}",
-        "__syncthreads();",
-        "const int in_tile = lane >> 2, part = lane & 3;",
-        "#pragma unroll 1",
-        f"for (int tile = warp; tile < {2 * count}; tile += everyone) {{",
-        "const int joint = tile >> 1, row = 16 * (tile & 1) + in_tile + 8 * (part & 1);",
-        "const long long world = first + (row < present ? row : present - 1);",
-        *joints.places(suffix)[1:],
-        "float sums[2];",
-        f"network{suffix}::tile(own + joint * {size} + 16 * (tile & 1), weights{suffix}.data, sums);",
-        *joints.limited("(part ? sums[1] : sums[0])", suffix),
-        "if (part < 2) {",
-        f"(tau_row + (row - lane) * {pitch(dof_count)})[dof] = torque;",
-        f"if (row < present && {ends}) {write}",
-        "}",
-        "}",
+        WAIT,
+        *_evaluate(joints, suffix, ends, write),
     ]
     return Before(
         joints.define(suffix), *("\n".join(part) for part in (start, beside, each)), _braced(cpu), count * (size + 96)
     )
+
+
+def _evaluate(joints: Joints, suffix: str, ends: str, write: str) -> list[str]:
+    """Return code in which workers evaluate networks of tensor cores; a row of a tile is a world."""
+    assert joints.half is not None
+    tiles, size = tensor_networks.TILES, joints.half.staged
+    parts, turns = 2 * tiles, 2 // tiles
+    return [
+        "const int part = lane & 3;",
+        "#pragma unroll 1",
+        f"for (int tile = worker; tile < {turns * joints.count}; tile += workers) {{",
+        f"const int joint = tile / {turns}, row = 16 * (tile % {turns}) + (lane >> 2) + 8 * (part % {parts});",
+        "const long long world = first + (row < present ? row : present - 1);",
+        *joints.places(suffix)[1:],
+        f"float sums[{parts}];",
+        f"network{suffix}::tiles(own + joint * {size} + 16 * (tile % {turns}), weights{suffix}.data, sums);",
+        *joints.limited(f"({_chosen('part') if tiles == 2 else 'part ? sums[1] : sums[0]'})", suffix),
+        f"if (part < {parts}) {{",
+        f"(tau_row + (row - lane) * {pitch(joints.sizes[1])})[dof] = torque;",
+        f"if (row < present && {ends}) {write}",
+        "}",
+        "}",
+    ]
+
+
+def _chosen(part: str) -> str:
+    """Return C++ for one of four sums; constant indices leave them in registers."""
+    return f"{part} == 0 ? sums[0] : {part} == 1 ? sums[1] : {part} == 2 ? sums[2] : sums[3]"
 
 
 def _block(condition: str, lines: list[str]) -> list[str]:

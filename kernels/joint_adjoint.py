@@ -21,9 +21,9 @@ import warp as wp
 from . import joint_passes, native
 from .joint_space import ARGUMENTS as SOLVED
 from .joint_space import (
-    BLOCK,
     DOF_FIELDS,
     SLOT_FIELDS,
+    WARP,
     Sizes,
     native_text,
     world_bytes,
@@ -44,14 +44,13 @@ of contacts [world, contact] they are whole for pairs, and lack what push and da
 """
 
 BEFORE = r"""
-enum { DOF_FIELDS = DOF_COUNT, SLOT_FIELDS = SLOT_COUNT };
 enum { K_DOF = 4 * TILES, K_SLOT = K_DOF + DOF_FIELDS * N, K_SHARE = K_SLOT + SLOT_FIELDS * S, KEPT = K_SHARE + LAWS };
 REAL* const history = work.data + world * work.shape[1];
 """
 AFTER = r"""
     EACH (i, K_DOF) history[(long long)number * KEPT + i] = s[AT_A + i];
     EACH (i, DOF_FIELDS * N) history[(long long)number * KEPT + K_DOF + i] = dof[i];
-    EACH (i, SLOT_FIELDS * S) history[(long long)number * KEPT + K_SLOT + i] = slot[i];
+    EACH (i, SLOT_FIELDS * slots) history[(long long)number * KEPT + K_SLOT + i] = slot[i];
     EACH (i, LAWS) history[(long long)number * KEPT + K_SHARE + i] = shares[i];
     SYNC
 """
@@ -85,25 +84,22 @@ for (int number = pass_count - 1; number >= 0; --number) {
     // -- lambda
     LOOP
     for (int j = 0; j < NB; ++j) {
-        const REAL l10 = now_dof[L10 * N + j], y0 = lambda[2 * j] * now_dof[I0 * N + j];
-        const REAL y1 = FMA(-l10, y0, lambda[2 * j + 1]) * now_dof[I1 * N + j];
-        EACH (a, count[j] - 1) {
-            const int row = rows[j * (NB + 1) + a];
+        const unsigned short* const rows = list + start[j] + 1;
+        REAL y0 = lambda[2 * j], y1 = lambda[2 * j + 1];
+        joint_space::divide(now_dof[I0 * N + j], now_dof[L10 * N + j], now_dof[I1 * N + j], y0, y1);
+        EACH (a, start[j + 1] - start[j] - 2) {
+            const int row = rows[a] >> 8;
             const REAL* const x = kept + 4 * joint_space::tile(row, j);
             lambda[2 * row] = FMA(-x[1], y1, FMA(-x[0], y0, lambda[2 * row]));
             lambda[2 * row + 1] = FMA(-x[3], y1, FMA(-x[2], y0, lambda[2 * row + 1]));
         }
         SYNC
-        if (lane == 0) {
-            lambda[2 * j] = y0;
-            lambda[2 * j + 1] = y1;
-        }
     }
     SYNC
     LOOP
     for (int j = NB - 1; j >= 0; --j) {
-        const REAL x1 = lambda[2 * j + 1] * now_dof[I1 * N + j];
-        const REAL x0 = FMA(-now_dof[L10 * N + j], x1, lambda[2 * j]) * now_dof[I0 * N + j];
+        REAL x0 = lambda[2 * j], x1 = lambda[2 * j + 1];
+        joint_space::divide(now_dof[I0 * N + j], now_dof[L10 * N + j], now_dof[I1 * N + j], x0, x1);
         EACH (k, j) {
             const REAL* const x = kept + 4 * joint_space::tile(j, k);
             lambda[2 * k] = FMA(-x[2], x1, FMA(-x[0], x0, lambda[2 * k]));
@@ -121,11 +117,12 @@ for (int number = pass_count - 1; number >= 0; --number) {
         const int pair = joint_space::pair_of(nears, slot_of[at]);
         const int* const row = table + T_COUPLE + (1 + MB) * table[T_PAIR + 2 * pair];
         const REAL* const value = pair_value + PV * pair;
-        const REAL kd = now_slot[KD * S + at], mu = value[P_FRICTION], spring = now_slot[PUSH * S + at];
+        const REAL *const now = now_slot + SLOT_FIELDS * at, *const earlier = old_slot + SLOT_FIELDS * at;
+        const REAL kd = now[KD], mu = value[P_FRICTION], spring = now[PUSH];
         REAL u0[3], u[3], damp[3], pushed[3] = {0, 0, 0}, moved[3] = {0, 0, 0};
         for (int r = 0; r < 3; ++r) {
-            u[r] = u0[r] = now_slot[(U0 + r) * S + at];
-            damp[r] = now_slot[(r ? CT : CN) * S + at];
+            u[r] = u0[r] = now[U0 + r];
+            damp[r] = now[r ? CT : CN];
         }
         for (int c = 0; c < row[0]; ++c)
             for (int r = 0; r < 3; ++r)
@@ -137,12 +134,12 @@ for (int number = pass_count - 1; number >= 0; --number) {
                     if (!first) u[r] = FMA(each, old_x[i], u[r]);
                 }
         // the law of this pass: along, across and force by the velocity that the pass before found
-        const int flags = (int)now_slot[FLAG * S + at], were = first ? 0 : (int)old_slot[FLAG * S + at];
+        const int flags = (int)now[FLAG], were = first ? 0 : (int)earlier[FLAG];
         const bool closed = flags & 1, candidate = flags & 2, shut = were & 1;
-        const REAL across = now_slot[ACROSS * S + at], push = FMA(-kd, u[0], spring);
+        const REAL across = now[ACROSS], push = FMA(-kd, u[0], spring);
         const REAL slip = sqrt(FMA(u[1], u[1], u[2] * u[2]));
         const bool pushes = (first ? candidate : shut) && push > 0;
-        const REAL fn = pushes ? push : 0, before = first ? 0 : old_slot[ACROSS * S + at];
+        const REAL fn = pushes ? push : 0, before = first ? 0 : earlier[ACROSS];
         const REAL over = first ? 0 : joint_space::positive(FMA(before, slip, -(mu * fn)));
         const REAL w = FMA(h * value[P_WEIGHT], over, slip);
         const REAL squared = FMA(w, w, value[P_EPS] * value[P_EPS]), rigid = (REAL)RIGID / (h * value[P_WEIGHT]);
@@ -183,7 +180,7 @@ for (int number = pass_count - 1; number >= 0; --number) {
             for (int r = 0; r < 3; ++r)
                 for (int d = 0; d < 2; ++d) {
                     const int i = 2 * (row[1 + c] & 255) + d;
-                    const REAL load = FMA(-damp[r], moved[r], now_slot[(F + r) * S + at]);
+                    const REAL load = FMA(-damp[r], moved[r], now[F + r]);
                     REAL more = FMA(load, lambda[i], -(damp[r] * pushed[r]) * now_x[i]);
                     if (!first) more = FMA(by_u[r], old_x[i], more);
                     J_b[(at * MB + c) * 6 + 2 * r + d] += more;
@@ -311,17 +308,16 @@ for (int number = pass_count - 1; number >= 0; --number) {
     SYNC
     // -- by the velocities of points: to the pass before; from the first one, to the rates before the step
     REAL *const to = first ? v0_b : x_b, *const by = first ? u0_b : u_b;
-    LOOP
-    for (int k = 0; k < runs; ++k) {
-        const int* const row = table + T_COUPLE + (1 + MB) * run_couple[k];
-        EACH (b, row[0]) {
-            REAL sum[2] = {0, 0};
-            for (int at = run_start[k]; at < run_start[k + 1]; ++at)
-                joint_space::push(J + (at * MB + b) * 6, by + 3 * at, 1, sum);
-            for (int d = 0; d < 2; ++d) to[2 * (row[1 + b] & 255) + d] += sum[d];
-        }
-        SYNC
+    EACH (j, NB) {
+        REAL sum[2] = {0, 0};
+        for (int w = 0; w < SLOT_WORDS; ++w)
+            for (unsigned int left = touching[j * SLOT_WORDS + w]; left; left &= left - 1) {
+                const int at = 32 * w + joint_space::first_of(left), c = joint_space::rank(slot_mask + at * WORDS, j);
+                joint_space::push(J + (at * MB + c) * 6, by + 3 * at, sum);
+            }
+        for (int d = 0; d < 2; ++d) to[2 * j + d] += sum[d];
     }
+    SYNC
     EACH (i, N) lambda[i] = x_b[i];
     SYNC
 }
@@ -387,7 +383,7 @@ EACH (contact, stiffness_bar.shape[1]) {
         if (table[T_PAIR + 2 * pair + 1] != contact) continue;
         const bool ground = pair >= PAIRS;
         const REAL share = ground ? 1 : (REAL)1 / nears[1 + NEAR + where / MOST];
-        by[0] += ground ? h * kd_b[at] : share * FMA(slot[DEPTH * S + at], spring_b[at], h * kd_b[at]);
+        by[0] += ground ? h * kd_b[at] : share * FMA(slot[SLOT_FIELDS * at + DEPTH], spring_b[at], h * kd_b[at]);
         by[1] += ground ? 0 : share * kd_b[at];
         by[2] += mu_b[at];
     }
@@ -433,16 +429,16 @@ EACH (own, DOFS) {
 
 
 def work_size(sizes: Sizes, passes: int) -> int:
-    """Return how many scalars of memory a world takes for so many passes."""
+    """Return how many scalars of memory a world takes for so many passes, a multiple of four."""
     n, tiles = 2 * sizes.tiles, sizes.tiles * (sizes.tiles + 1) // 2 + sizes.tiles
     kept = 4 * tiles + DOF_FIELDS * n + SLOT_FIELDS * sizes.slots + sizes.laws
-    return passes * kept + 5 * n + sizes.laws + (4 + 6 + 6 * sizes.columns) * sizes.slots
+    size = passes * kept + 5 * n + sizes.laws + (4 + 6 + 6 * sizes.columns) * sizes.slots
+    return -(-size // 4) * 4
 
 
 @functools.cache
 def adjoint(sizes: Sizes, T: type) -> wp.Kernel:
-    """Return the kernel; it launches BLOCK threads a world on CUDA, one on the CPU, in blocks of BLOCK."""
-    before = BEFORE.replace("DOF_COUNT", str(DOF_FIELDS)).replace("SLOT_COUNT", str(SLOT_FIELDS))
+    """Return the kernel; it launches WARP threads a world on CUDA, one on the CPU, in blocks of WARP."""
     passes = joint_passes.PASSES.replace(joint_passes.AFTER_A_PASS, AFTER)
-    text = native_text(before + passes + BACK + RESULTS + joint_passes.END, sizes, T, BLOCK, 0)
+    text = native_text(BEFORE + passes + BACK + RESULTS + joint_passes.END, sizes, T, WARP, 0)
     return native.kernel("joint_adjoint", text, ARGUMENTS, T, shared=world_bytes(sizes, T))

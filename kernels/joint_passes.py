@@ -6,33 +6,28 @@ It continues the text of :mod:`.joint_points`.
 AFTER_A_PASS = "    // -- after a pass\n"
 """Line of PASSES where the unknown of a pass, its laws and its factors are known."""
 PASSES = r"""
+int lane_a, lane_b, next_a, next_b;  // of the first two rounds of products of a column
+joint_space::corner(lane, lane_a, lane_b);
+joint_space::corner(lane + LANES, next_a, next_b);
 LOOP
 for (int number = 0;; ++number) {
     const bool first = number == 0, last = number == pass_count - 1 && pass_count >= 3, done = number == pass_count;
+    EACH (w, SLOT_WORDS) active[w] = 0;
+    SYNC
     // -- laws of the points; after the last pass only what they say of it
     EACH (at, slots) {
-        const int where = slot_of[at], pair = joint_space::pair_of(nears, where);
-        const int* const row = table + T_COUPLE + (1 + MB) * table[T_PAIR + 2 * pair];
+        const int pair = slot_pair[at];
         const REAL* const value = pair_value + PV * pair;
-        const REAL kd = slot[KD * S + at], mu = value[P_FRICTION], spring = slot[PUSH * S + at];
-        const REAL depth = slot[DEPTH * S + at];
-        const REAL before[3] = {slot[U0 * S + at], slot[(U0 + 1) * S + at], slot[(U0 + 2) * S + at]};
+        const REAL kd = slot[SLOT_FIELDS * at + KD], mu = value[P_FRICTION], spring = slot[SLOT_FIELDS * at + PUSH];
+        const REAL depth = slot[SLOT_FIELDS * at + DEPTH];
+        const REAL* const was = slot + SLOT_FIELDS * at + U0;
+        const REAL before[3] = {was[0], was[1], was[2]};
         REAL u[3] = {before[0], before[1], before[2]};
-        if (!first) {
-            LOOP
-            for (int c = 0; c < row[0]; ++c) {
-                const Two x = *(const Two*)(dof + X * N + 2 * (row[1 + c] & 255));
-                UNROLL
-                for (int r = 0; r < 3; ++r) {
-                    const Two each = *(const Two*)(J + (at * MB + c) * 6 + 2 * r);
-                    u[r] = FMA(each.y, x.y, FMA(each.x, x.x, u[r]));
-                }
-            }
-        }
-        const int flags = (int)slot[FLAG * S + at];
+        if (!first) joint_space::add_velocity(J + at * MB * 6, slot_mask + at * WORDS, dof + X * N, u);
+        const int flags = (int)slot[SLOT_FIELDS * at + FLAG];
         const bool shut = flags & 1;
         const REAL push = FMA(-kd, u[0], spring), slip = sqrt(FMA(u[1], u[1], u[2] * u[2]));
-        REAL across = slot[ACROSS * S + at], w = slip;
+        REAL across = slot[SLOT_FIELDS * at + ACROSS], w = slip;
         bool candidate;
         REAL fn;
         if (first) {
@@ -49,31 +44,32 @@ for (int number = 0;; ++number) {
                 pull = -normal > pull ? -normal : pull;
                 const REAL lacks = shut || !candidate ? 0 : joint_space::positive(push);
                 missed = lacks > missed ? lacks : missed;
-                slot[F * S + at] = normal;
-                slot[(F + 1) * S + at] = -across * u[1];
-                slot[(F + 2) * S + at] = -across * u[2];
-                slot[ACROSS * S + at] = slip;
+                slot[SLOT_FIELDS * at + F] = normal;
+                slot[SLOT_FIELDS * at + F + 1] = -across * u[1];
+                slot[SLOT_FIELDS * at + F + 2] = -across * u[2];
+                slot[SLOT_FIELDS * at + ACROSS] = slip;
                 continue;
             }
         }
         const bool closed = (candidate && (first || push > 0)) || (last && shut);
-        across = mu * fn / sqrt(FMA(w, w, value[P_EPS] * value[P_EPS]));
-        const REAL rigid = (REAL)RIGID / (h * value[P_WEIGHT]);
+        across = mu * fn * joint_space::inverse_root(FMA(w, w, value[P_EPS] * value[P_EPS]));
+        const REAL rigid = (REAL)RIGID * joint_space::inverse(h * value[P_WEIGHT]);
         across = across > rigid ? rigid : across;
-        slot[ACROSS * S + at] = across;
-        slot[FLAG * S + at] = closed + 2 * candidate;
-        slot[CN * S + at] = closed ? h * kd : 0;
-        slot[CT * S + at] = h * across;
-        slot[F * S + at] = closed ? h * FMA(-kd, before[0], spring) : 0;
-        slot[(F + 1) * S + at] = -h * across * before[1];
-        slot[(F + 2) * S + at] = -h * across * before[2];
+        slot[SLOT_FIELDS * at + ACROSS] = across;
+        slot[SLOT_FIELDS * at + FLAG] = closed + 2 * candidate;
+        if (closed || across > 0) joint_space::set_bits(active + at / 32, 1u << (at & 31));
+        slot[SLOT_FIELDS * at + CN] = closed ? h * kd : 0;
+        slot[SLOT_FIELDS * at + CT] = h * across;
+        slot[SLOT_FIELDS * at + F] = closed ? h * FMA(-kd, before[0], spring) : 0;
+        slot[SLOT_FIELDS * at + F + 1] = -h * across * before[1];
+        slot[SLOT_FIELDS * at + F + 2] = -h * across * before[2];
     }
     // -- laws of the dofs: drive, springs, dry friction, limits
     EACH (i, N) {
         const int own = table[T_DOF_OF + i];
         if (own < 0) {
             dof[D * N + i] = 1;
-            dof[R * N + i] = 0;
+            dof[R * N + i] = dof[CHANGE * N + i] = 0;
             continue;
         }
         const REAL* const value = dof_value + DV * own;
@@ -157,128 +153,133 @@ for (int number = 0;; ++number) {
         }
         dof[D * N + i] = h * resistance;
         dof[R * N + i] = h * FMA(-resistance, before, force);
+        dof[CHANGE * N + i] = (REAL)FLOOR / value[C_WEIGHT];  // a pivot is an inertia at least, if nothing is rounded
     }
     if (done) break;
-    // -- A: the mass matrix and the laws of the dofs
-    EACH (t, TILES) A[t] = {{0, 0, 0, 0}};
     SYNC
-    EACH (e, NNZ) {
-        const int to = table[T_ENTRY + e];
-        if (to >= 0) {
-            A[to >> 2].x[to & 3] = held_mass[e];
+    // -- A: of each tile the mass matrix, the laws of the dofs, and the points that are not open
+    LOOP
+    for (int item = lane; item < start[NB]; item += LANES) {
+        const int i = list[item] >> 8, j = list[item] & 255;
+        const unsigned int *const to_i = touching + i * SLOT_WORDS, *const to_j = touching + j * SLOT_WORDS;
+        Tile sum = {{0, 0, 0, 0}};
+        if (i == NB) {
+            sum.x[0] = dof[R * N + 2 * j];
+            sum.x[1] = dof[R * N + 2 * j + 1];
         } else {
-            const int i = ~to;
-            A[joint_space::tile(i >> 1, i >> 1)].x[3 * (i & 1)] = held_mass[e] + dof[D * N + i];
+            const int held = table[T_HELD + joint_space::tile(i, j)];
+            if (held >= 0) sum = *(const Tile*)(held_mass + 4 * held);
+            if (i == j) {
+                sum.x[0] += dof[D * N + 2 * j];
+                sum.x[3] += dof[D * N + 2 * j + 1];
+            }
         }
-    }
-    EACH (i, N) {
-        if (table[T_DOF_OF + i] < 0) A[joint_space::tile(i >> 1, i >> 1)].x[3 * (i & 1)] = 1;
-        A[joint_space::tile(NB, i >> 1)].x[i & 1] = dof[R * N + i];
-        const int own = table[T_DOF_OF + i];  // a pivot is an inertia at least, if nothing is rounded
-        dof[CHANGE * N + i] = own < 0 ? 0 : (REAL)FLOOR / dof_value[DV * own + C_WEIGHT];
+        int pair = -1, from_j = 0, from_i = 0;
+        LOOP
+        for (int w = 0; w < SLOT_WORDS; ++w) {
+            LOOP
+            for (unsigned int left = to_j[w] & active[w] & (i == NB ? ~0u : to_i[w]); left; left &= left - 1) {
+                const int at = 32 * w + joint_space::first_of(left);
+                if (slot_pair[at] != pair) {
+                    pair = slot_pair[at];
+                    from_j = 6 * joint_space::rank(slot_mask + at * WORDS, j);
+                    from_i = i == NB ? 0 : 6 * joint_space::rank(slot_mask + at * WORDS, i);
+                }
+                const REAL *const one = J + at * (6 * MB) + from_j, *const other = J + at * (6 * MB) + from_i;
+                if (i == NB) {
+                    joint_space::push(one, slot + SLOT_FIELDS * at + F, sum.x);
+                    continue;
+                }
+                UNROLL
+                for (int r = 0; r < 3; ++r) {
+                    const REAL c = slot[SLOT_FIELDS * at + (r ? CT : CN)];
+                    const Two a = *(const Two*)(one + 2 * r), b = *(const Two*)(other + 2 * r);
+                    const REAL x = c * a.x, y = c * a.y;
+                    sum.x[0] = FMA(b.x, x, sum.x[0]);
+                    sum.x[1] = FMA(b.x, y, sum.x[1]);
+                    sum.x[2] = FMA(b.y, x, sum.x[2]);
+                    sum.x[3] = FMA(b.y, y, sum.x[3]);
+                }
+            }
+        }
+        A[joint_space::tile(i, j)] = sum;
     }
     SYNC
-    // -- A: the points, a couple after the other; open ones are left out
+    // -- factors, a column of tiles after the other; the right side is the last row
     LOOP
-    for (int k = 0; ANY(k < runs); ++k) {
-        if (k < runs) {
-            const int* const row = table + T_COUPLE + (1 + MB) * run_couple[k];
-            const int begin = run_start[k], end = run_start[k + 1];
-            const int blocks = row[0], triangle = blocks * (blocks + 1) / 2;
-            LOOP
-            for (int t = lane; t < triangle + blocks; t += LANES) {
-                int a = blocks, b = t - triangle;
-                if (t < triangle) joint_space::corner(t, a, b);
-                REAL sum[4] = {0, 0, 0, 0};
-                LOOP
-                for (int at = begin; at < end; ++at) {
-                    const REAL along = slot[CN * S + at], across = slot[CT * S + at];
-                    if (along == 0 && across == 0) continue;
-                    const Two* const one = (const Two*)(J + (at * MB + b) * 6);
-                    if (t >= triangle) {
-                        joint_space::push(J + (at * MB + b) * 6, slot + F * S + at, S, sum);
-                        continue;
-                    }
-                    const Two* const other = (const Two*)(J + (at * MB + a) * 6);
-                    UNROLL
-                    for (int r = 0; r < 3; ++r) {
-                        const REAL c = r ? across : along, x = c * one[r].x, y = c * one[r].y;
-                        sum[0] = FMA(other[r].x, x, sum[0]);
-                        sum[1] = FMA(other[r].x, y, sum[1]);
-                        sum[2] = FMA(other[r].y, x, sum[2]);
-                        sum[3] = FMA(other[r].y, y, sum[3]);
-                    }
-                }
-                Tile& to = A[joint_space::tile(t < triangle ? row[1 + a] & 255 : NB, row[1 + b] & 255)];
-                UNROLL
-                for (int e = 0; e < 4; ++e) to.x[e] += sum[e];
-            }
-        }
-        SYNC
-    }
-    // -- Cholesky, a column of tiles after the other; the right side is the last row
-    floored = false;
-    LOOP
-    for (int j = 0; j < NB; ++j) {
-        const int below = count[j];
-        const unsigned char* const list = rows + j * (NB + 1);
-        const Tile diagonal = A[joint_space::tile(j, j)];
-        const REAL d0 = diagonal.x[0], least0 = dof[CHANGE * N + 2 * j], least1 = dof[CHANGE * N + 2 * j + 1];
-        const REAL i0 = joint_space::inverse_root(d0 < least0 ? least0 : d0), l10 = diagonal.x[2] * i0;
-        const REAL d1 = FMA(-l10, l10, diagonal.x[3]), i1 = joint_space::inverse_root(d1 < least1 ? least1 : d1);
-        floored |= d0 < least0 || d1 < least1;
-        if (lane == 0) {
-            dof[I0 * N + j] = i0;
-            dof[L10 * N + j] = l10;
-            dof[I1 * N + j] = i1;
-        }
-        EACH (a, below) {
-            Tile& to = A[joint_space::tile(list[a], j)];
-            const Tile x = to;
-            Tile y;
-            UNROLL
-            for (int r = 0; r < 4; r += 2) {
-                y.x[r] = x.x[r] * i0;
-                y.x[r + 1] = FMA(-l10, y.x[r], x.x[r + 1]) * i1;
-            }
-            to = y;
-        }
-        SYNC
+    for (int j = 0, from = 0, next; j < NB; ++j, from = next) {
+        next = start[j + 1];
+        const unsigned short* const rows = list + from + 1;
+        const int below = next - from - 1, products = below * (below + 1) / 2 - 1;
+        const Pivot p = joint_space::pivot(A[joint_space::tile(j, j)], dof + CHANGE * N + 2 * j);
+        int a = lane_a, b = lane_b;
         LOOP
-        for (int t = lane; t < below * (below + 1) / 2 - 1; t += LANES) {
-            int a, b;
-            joint_space::corner(t, a, b);
-            const Tile x = A[joint_space::tile(list[a], j)], y = A[joint_space::tile(list[b], j)];
-            Tile& to = A[joint_space::tile(list[a], list[b])];
+        for (int t = lane; t < products; t += LANES) {
+            if (t >= 2 * LANES) joint_space::corner(t, a, b);
+            const int i = rows[a] >> 8, k = rows[b] >> 8;
+            const Tile x = A[joint_space::tile(i, j)];
+            Tile y = A[joint_space::tile(k, j)];
+            Tile& to = A[joint_space::tile(i, k)];
             Tile z = to;
             UNROLL
-            for (int e = 0; e < 4; ++e) {
-                const int r = e & 2, c = 2 * (e & 1);
-                z.x[e] = FMA(-x.x[r + 1], y.x[c + 1], FMA(-x.x[r], y.x[c], z.x[e]));
+            for (int c = 0; c < 2; ++c) {
+                joint_space::divide(p.i0, p.l, p.i1, y.x[2 * c], y.x[2 * c + 1]);
+                z.x[c] = FMA(-x.x[1], y.x[2 * c + 1], FMA(-x.x[0], y.x[2 * c], z.x[c]));
+                z.x[2 + c] = FMA(-x.x[3], y.x[2 * c + 1], FMA(-x.x[2], y.x[2 * c], z.x[2 + c]));
             }
             to = z;
+            a = next_a;
+            b = next_b;
         }
         SYNC
     }
-    // -- back substitution, and in the last pass a step of refinement with the same factor
+    floored = false;
+    EACH (j, NB) {
+        const Pivot p = joint_space::pivot(A[joint_space::tile(j, j)], dof + CHANGE * N + 2 * j);
+        floored |= p.low;
+        dof[I0 * N + j] = p.i0;
+        dof[L10 * N + j] = p.l;
+        dof[I1 * N + j] = p.i1;
+    }
+    SYNC
+    // -- back substitution, and in the last pass a step of refinement with the same factors
     LOOP
     for (int refined = 0;; ++refined) {
+        // a lane has the right side of its blocks; what is not listed of a row is zero
+        REAL own[EACH_LANE][2];
+        UNROLL_LANES
+        for (int p = 0; p < EACH_LANE; ++p) {
+            const int k = lane + p * LANES;
+            const Tile& y = A[joint_space::tile(NB, k < NB ? k : 0)];
+            own[p][0] = y.x[0];
+            own[p][1] = y.x[1];
+        }
         LOOP
         for (int j = NB - 1; j >= 0; --j) {
-            const Tile& y = A[joint_space::tile(NB, j)];
-            const REAL x1 = y.x[1] * dof[I1 * N + j], x0 = FMA(-dof[L10 * N + j], x1, y.x[0]) * dof[I0 * N + j];
-            if (lane == 0) {
-                dof[CHANGE * N + 2 * j] = x0;
-                dof[CHANGE * N + 2 * j + 1] = x1;
-            }
-            EACH (k, j) {
+            REAL x0, x1;
+            joint_space::share_two(own, j, x0, x1);
+            joint_space::divide(dof[I0 * N + j], dof[L10 * N + j], dof[I1 * N + j], x0, x1);
+            UNROLL_LANES
+            for (int p = 0; p < EACH_LANE; ++p) {
+                const int k = lane + p * LANES;
+                if (k == j) {
+                    own[p][0] = x0;
+                    own[p][1] = x1;
+                }
+                if (k >= j) continue;
                 const Tile x = A[joint_space::tile(j, k)];
-                Tile& to = A[joint_space::tile(NB, k)];
-                to.x[0] = FMA(-x.x[2], x1, FMA(-x.x[0], x0, to.x[0]));
-                to.x[1] = FMA(-x.x[3], x1, FMA(-x.x[1], x0, to.x[1]));
+                own[p][0] = FMA(-x.x[2], x1, FMA(-x.x[0], x0, own[p][0]));
+                own[p][1] = FMA(-x.x[3], x1, FMA(-x.x[1], x0, own[p][1]));
             }
-            SYNC
         }
+        UNROLL_LANES
+        for (int p = 0; p < EACH_LANE; ++p) {
+            const int k = lane + p * LANES;
+            if (k >= NB) continue;
+            dof[CHANGE * N + 2 * k] = own[p][0];
+            dof[CHANGE * N + 2 * k + 1] = own[p][1];
+        }
+        SYNC
         const bool more = number == pass_count - 1 && refined < REFINE;
         EACH (i, N) {
             const REAL x = dof[CHANGE * N + i];
@@ -288,62 +289,55 @@ for (int number = 0;; ++number) {
             for (int e = table[T_ROW_START + i]; e < table[T_ROW_START + i + 1]; ++e)
                 left = FMA(-held_mass[table[T_ROW + e] >> 8], dof[CHANGE * N + (table[T_ROW + e] & 255)], left);
             dof[R * N + i] = left;
-            A[joint_space::tile(NB, i >> 1)].x[i & 1] = left;
         }
         if (!more) break;
         EACH (at, slots) {
-            const int* const row = table + T_COUPLE
-                + (1 + MB) * table[T_PAIR + 2 * joint_space::pair_of(nears, slot_of[at])];
-            REAL u[3] = {0, 0, 0};
-            LOOP
-            for (int c = 0; c < row[0]; ++c) {
-                const Two x = *(const Two*)(dof + CHANGE * N + 2 * (row[1 + c] & 255));
-                UNROLL
-                for (int r = 0; r < 3; ++r) {
-                    const Two each = *(const Two*)(J + (at * MB + c) * 6 + 2 * r);
-                    u[r] = FMA(each.y, x.y, FMA(each.x, x.x, u[r]));
-                }
-            }
+            REAL u[3] = {0, 0, 0}, *const load = slot + SLOT_FIELDS * at;
+            joint_space::add_velocity(J + at * MB * 6, slot_mask + at * WORDS, dof + CHANGE * N, u);
             UNROLL
             for (int r = 0; r < 3; ++r)
-                slot[(F + r) * S + at] = FMA(-slot[(r ? CT : CN) * S + at], u[r], slot[(F + r) * S + at]);
+                load[F + r] = FMA(-load[r ? CT : CN], u[r], load[F + r]);
         }
         SYNC
-        LOOP
-        for (int k = 0; ANY(k < runs); ++k) {
-            if (k < runs) {
-                const int* const row = table + T_COUPLE + (1 + MB) * run_couple[k];
+        EACH (j, NB) {
+            REAL sum[2] = {dof[R * N + 2 * j], dof[R * N + 2 * j + 1]};
+            LOOP
+            for (int w = 0; w < SLOT_WORDS; ++w) {
                 LOOP
-                EACH (b, row[0]) {
-                    REAL sum[2] = {0, 0};
-                    LOOP
-                    for (int at = run_start[k]; at < run_start[k + 1]; ++at)
-                        joint_space::push(J + (at * MB + b) * 6, slot + F * S + at, S, sum);
-                    Tile& to = A[joint_space::tile(NB, row[1 + b] & 255)];
-                    to.x[0] += sum[0];
-                    to.x[1] += sum[1];
+                for (unsigned int left = touching[j * SLOT_WORDS + w] & active[w]; left; left &= left - 1) {
+                    const int at = 32 * w + joint_space::first_of(left);
+                    const int c = joint_space::rank(slot_mask + at * WORDS, j);
+                    joint_space::push(J + (at * MB + c) * 6, slot + SLOT_FIELDS * at + F, sum);
                 }
             }
-            SYNC
+            A[joint_space::tile(NB, j)] = {{sum[0], sum[1], 0, 0}};
+        }
+        SYNC
+        UNROLL_LANES
+        for (int p = 0; p < EACH_LANE; ++p) {
+            const int k = lane + p * LANES;
+            const Tile& y = A[joint_space::tile(NB, k < NB ? k : 0)];
+            own[p][0] = y.x[0];
+            own[p][1] = y.x[1];
         }
         LOOP
-        for (int j = 0; j < NB; ++j) {
-            const int below = count[j] - 1;
-            const unsigned char* const list = rows + j * (NB + 1);
-            Tile& own = A[joint_space::tile(NB, j)];
-            const REAL y0 = own.x[0] * dof[I0 * N + j];
-            const REAL y1 = FMA(-dof[L10 * N + j], y0, own.x[1]) * dof[I1 * N + j];
-            EACH (a, below) {
-                const Tile x = A[joint_space::tile(list[a], j)];
-                Tile& to = A[joint_space::tile(NB, list[a])];
-                to.x[0] = FMA(-x.x[1], y1, FMA(-x.x[0], y0, to.x[0]));
-                to.x[1] = FMA(-x.x[3], y1, FMA(-x.x[2], y0, to.x[1]));
+        for (int j = 0; j < NB - 1; ++j) {
+            REAL y0, y1;
+            joint_space::share_two(own, j, y0, y1);
+            joint_space::divide(dof[I0 * N + j], dof[L10 * N + j], dof[I1 * N + j], y0, y1);
+            UNROLL_LANES
+            for (int p = 0; p < EACH_LANE; ++p) {
+                const int k = lane + p * LANES;
+                if (k <= j || k >= NB) continue;
+                const Tile x = A[joint_space::tile(k, j)];
+                own[p][0] = FMA(-x.x[1], y1, FMA(-x.x[0], y0, own[p][0]));
+                own[p][1] = FMA(-x.x[3], y1, FMA(-x.x[2], y0, own[p][1]));
             }
-            SYNC
-            if (lane == 0) {
-                own.x[0] = y0;
-                own.x[1] = y1;
-            }
+        }
+        UNROLL_LANES
+        for (int p = 0; p < EACH_LANE; ++p) {
+            const int k = lane + p * LANES;
+            if (k < NB) A[joint_space::tile(NB, k)] = {{own[p][0], own[p][1], 0, 0}};
         }
         SYNC
     }
@@ -353,7 +347,6 @@ for (int number = 0;; ++number) {
 """
 RESULTS = r"""// -- results
 SYNC
-REAL *const excesses = s + AT_A;
 int wrong = floored;  // 1: a result is no number, or rounding is more than a pivot; 2: an input is none
 LOOP
 EACH (i, N) {
@@ -366,19 +359,17 @@ EACH (i, N) {
     if (table[T_COORDINATE + own] >= 0)
         wrong |= joint_space::lost(target_q.data[world * q.shape[1] + table[T_COORDINATE + own]]) ? 2 : 0;
 }
-LOOP
-EACH (i, PV * (PAIRS + SURFACES) + 1) wrong |= joint_space::lost(pair_value[i]) ? 2 : 0;
+if (pair_values.shape[0] > 1) EACH (i, PV * (PAIRS + SURFACES) + 1) wrong |= joint_space::lost(pair_value[i]) ? 2 : 0;
 LOOP
 EACH (i, LAW * LAWS) wrong |= joint_space::lost(motor[i]) ? 2 : 0;
-LOOP
-EACH (i, DV * DOFS) wrong |= joint_space::lost(dof_value[i]) ? 2 : 0;
+if (dof_values.shape[0] > 1) EACH (i, DV * DOFS) wrong |= joint_space::lost(dof_value[i]) ? 2 : 0;
 LOOP
 EACH (i, SURFACES) missed = surface[i * SURFACE + 10] > 0 ? (REAL)1e30 : missed;  // comes out of the ground slowly
-excesses[5 * lane] = cone;
-excesses[5 * lane + 1] = pull;
-excesses[5 * lane + 2] = effort_excess;
-excesses[5 * lane + 3] = missed;
-excesses[5 * lane + 4] = (REAL)wrong;
+cone = joint_space::largest(cone);
+pull = joint_space::largest(pull);
+effort_excess = joint_space::largest(effort_excess);
+missed = joint_space::largest(missed);
+wrong = joint_space::any_bits(wrong);
 if (alive) {
     EACH (i, N) {
         const int own = table[T_DOF_OF + i];
@@ -396,12 +387,12 @@ if (alive) {
         REAL f[3] = {0, 0, 0}, gap = 0, slip = 0;
         bool any = false;
         LOOP
-        for (int at = 0; at < slots; ++at) {
+        for (int at = paired; at < slots; ++at) {
             const int where = slot_of[at];
-            if (where < NEAR * MOST || table[T_PAIR + 2 * joint_space::pair_of(nears, where) + 1] != point) continue;
+            if (table[T_PAIR + 2 * slot_pair[at] + 1] != point) continue;
             const REAL* const found = joint_space::point_of(touch, surface, where);
-            joint_space::add_force(found + 3, slot + F * S + at, S, f);
-            if (!any) slip = slot[ACROSS * S + at];
+            joint_space::add_force(found + 3, slot + SLOT_FIELDS * at + F, f);
+            if (!any) slip = slot[SLOT_FIELDS * at + ACROSS];
             gap = !any || found[9] < gap ? found[9] : gap;
             any = true;
         }
@@ -416,14 +407,12 @@ if (alive) {
     EACH (k, number_near) {
         if (nears[1 + k] < 0) continue;
         REAL f[3] = {0, 0, 0}, deepest = -AWAY, slip = 0;
-        for (int at = 0; at < slots; ++at) {
-            const int where = slot_of[at];
-            if (where >= NEAR * MOST || where / MOST != k) continue;
-            if (slot[DEPTH * S + at] > deepest) {
-                deepest = slot[DEPTH * S + at];
-                slip = slot[ACROSS * S + at];
+        for (int at = begin[k]; at < begin[k + 1]; ++at) {
+            if (slot[SLOT_FIELDS * at + DEPTH] > deepest) {
+                deepest = slot[SLOT_FIELDS * at + DEPTH];
+                slip = slot[SLOT_FIELDS * at + ACROSS];
             }
-            joint_space::add_force(touch + where * POINT + 3, slot + F * S + at, S, f);
+            joint_space::add_force(touch + slot_of[at] * POINT + 3, slot + SLOT_FIELDS * at + F, f);
         }
         const long long row = world * contact_f.shape[1] + table[T_PAIR + 2 * nears[1 + k] + 1];
         for (int c = 0; c < 3; ++c) contact_f.data[row * 3 + c] = f[c];
@@ -431,18 +420,13 @@ if (alive) {
         contact_slip.data[row] = slip;
     }
     if (lane == 0) {
-        REAL worst[4] = {0, 0, 0, 0};
-        int all_wrong = 0;
-        LOOP
-        for (int l = 0; l < LANES; ++l) {
-            for (int e = 0; e < 4; ++e) worst[e] = excesses[5 * l + e] > worst[e] ? excesses[5 * l + e] : worst[e];
-            all_wrong |= (int)excesses[5 * l + 4];
-        }
-        for (int e = 0; e < 3; ++e) excess.data[world * 3 + e] = worst[e];
-        const bool beyond = worst[0] > most_force || worst[1] > most_force || worst[3] > most_force
-            || worst[2] > most_effort;
+        excess.data[world * 3] = cone;
+        excess.data[world * 3 + 1] = pull;
+        excess.data[world * 3 + 2] = effort_excess;
+        const REAL apart = cone > pull ? cone : pull;  // from the laws of the points
+        const bool beyond = apart > most_force || missed > most_force || effort_excess > most_effort;
         const bool crowded = total > S - SURFACES || nears[0] > NEAR;
-        status.data[world] = all_wrong & 2 ? NOT_FINITE : all_wrong ? PIVOT : crowded ? CROWDED : beyond ? CONTACT : 0;
+        status.data[world] = wrong & 2 ? NOT_FINITE : wrong ? PIVOT : crowded ? CROWDED : beyond ? CONTACT : 0;
     }
 }
 """
@@ -450,4 +434,5 @@ END = r"""#undef LANES
 #undef SYNC
 #undef ANY
 #undef EACH
+#undef EACH_LANE
 """

@@ -7,6 +7,48 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 CHUNK = 32  # samples of a partial sum
+Four = wp.types.matrix((4, 2), wp.float32)  # pairs of four samples
+
+
+@wp.func
+def split(word: wp.uint64) -> wp.vec2f:
+    """Return the two numbers of float32 that a word holds, or of bfloat16."""
+    low, high = wp.uint32(word & wp.uint64(0xFFFFFFFF)), wp.uint32(word >> wp.uint64(32))
+    return wp.vec2f(wp.cast(low, wp.float32), wp.cast(high, wp.float32))
+
+
+@wp.func  # type: ignore[no-redef]
+def split(word: wp.uint32) -> wp.vec2f:  # noqa: F811
+    high = (word >> wp.uint32(16)) << wp.uint32(16)
+    return wp.vec2f(wp.cast(word << wp.uint32(16), wp.float32), wp.cast(high, wp.float32))
+
+
+@wp.func
+def join(low: wp.float32, high: wp.float32, like: wp.uint64) -> wp.uint64:
+    """Return the word of two numbers, of the kind of ``like``."""
+    return wp.uint64(wp.cast(low, wp.uint32)) | (wp.uint64(wp.cast(high, wp.uint32)) << wp.uint64(32))
+
+
+@wp.func  # type: ignore[no-redef]
+def join(low: wp.float32, high: wp.float32, like: wp.uint32) -> wp.uint32:  # noqa: F811
+    a, b = wp.cast(wp.bfloat16(low), wp.uint16), wp.cast(wp.bfloat16(high), wp.uint16)
+    return wp.uint32(a) | (wp.uint32(b) << wp.uint32(16))
+
+
+@wp.func
+def elu(x: wp.float32) -> wp.float32:
+    if not x > 0.0:
+        x = wp.exp(x) - 1.0
+    return x
+
+
+@wp.func
+def slope_of_elu(y: wp.float32) -> wp.float32:
+    """Return the slope of ELU where its result is ``y``."""
+    slope = y + 1.0
+    if y > 0.0:
+        slope = 1.0
+    return slope
 
 
 @wp.kernel
@@ -36,46 +78,41 @@ def compute_returns(
 
 
 @wp.kernel
-def add_bias_and_elu(values: wp.array2d(dtype=Any), bias: wp.array(dtype=wp.float32)):
-    """Set values [sample, unit] to ``elu(values + bias)``; threads (ceil(samples / 4), units)."""
-    part, unit = wp.tid()
-    last, offset = values.shape[0] - 1, bias[unit]
-    found = wp.vec4f()
+def add_bias_and_elu(values: wp.array2d(dtype=Any), bias: wp.array(dtype=wp.vec2f)):
+    """Set values [sample, pair of units] to ``elu(values + bias)``; threads (ceil(samples / 4), pairs)."""
+    part, pair = wp.tid()
+    last, offset = values.shape[0] - 1, bias[pair]
+    found = Four()
     for k in range(4):
-        x = wp.float32(values[wp.min(4 * part + k, last), unit]) + offset
-        if not x > 0.0:
-            x = wp.exp(x) - 1.0
-        found[k] = x
+        x = split(values[wp.min(4 * part + k, last), pair]) + offset
+        found[k] = wp.vec2f(elu(x[0]), elu(x[1]))
     for k in range(4):
-        values[wp.min(4 * part + k, last), unit] = values.dtype(found[k])
+        values[wp.min(4 * part + k, last), pair] = join(found[k, 0], found[k, 1], values.dtype(0))
 
 
 @wp.kernel
 def differentiate_elu(
-    results: wp.array2d(dtype=Any), gradient: wp.array2d(dtype=Any), sums: wp.array2d(dtype=wp.float32)
+    results: wp.array2d(dtype=Any), gradient: wp.array2d(dtype=Any), sums: wp.array2d(dtype=wp.vec2f)
 ):
-    """Make of the gradient of ELU's results that of its arguments [sample, unit], and sum it over parts of the samples.
+    """Make of the gradient of ELU's results that of its arguments [sample, pair of units], and sum it over parts.
 
-    Threads (ceil(samples / 32), units), as ``sums`` [part, unit] has entries.
+    Threads (ceil(samples / 32), pairs), as ``sums`` [part, pair] has entries.
     """
-    part, unit = wp.tid()
+    part, pair = wp.tid()
     count = results.shape[0]
-    total = wp.float32(0.0)
+    total = wp.vec2f()
     for i in range(8):
         start = 32 * part + 4 * i
-        found = wp.vec4f()
+        found = Four()
         for k in range(4):
             row = wp.min(start + k, count - 1)
-            y = wp.float32(results[row, unit])
-            slope = y + 1.0
-            if y > 0.0:
-                slope = 1.0
-            found[k] = wp.float32(gradient[row, unit]) * slope
+            y, above = split(results[row, pair]), split(gradient[row, pair])
+            found[k] = wp.vec2f(above[0] * slope_of_elu(y[0]), above[1] * slope_of_elu(y[1]))
         for k in range(4):
             if start + k < count:
-                gradient[start + k, unit] = gradient.dtype(found[k])
+                gradient[start + k, pair] = join(found[k, 0], found[k, 1], gradient.dtype(0))
                 total += found[k]
-    sums[part, unit] = total
+    sums[part, pair] = total
 
 
 @wp.kernel
@@ -92,7 +129,7 @@ def surrogate_loss(
         means: of the policy, without ``bias`` [sample, action]. deviations: before they are clamped to ``least`` to
             ``most`` [action].
         gradient: of the mean loss with respect to means [sample, action].
-        terms: parts of sums over samples [sample, 2 actions + 2]: the gradient with respect to deviations and to
+        terms: parts of sums over samples [2 actions + 2, sample]: the gradient with respect to deviations and to
             ``bias``, the loss, the KL divergence of the new policy from the old one.
     """
     i = wp.tid()
@@ -119,10 +156,10 @@ def surrogate_loss(
         off = (actions[i, j] - mean) / deviation
         entry = slope * off / deviation
         gradient[i, j] = gradient.dtype(entry)
-        terms[i, j] = slope * (off * off - 1.0) / deviation
-        terms[i, size + j] = entry
-    terms[i, 2 * size] = loss * share
-    terms[i, 2 * size + 1] = divergence * share
+        terms[j, i] = slope * (off * off - 1.0) / deviation
+        terms[size + j, i] = entry
+    terms[2 * size, i] = loss * share
+    terms[2 * size + 1, i] = divergence * share
 
 
 @wp.kernel
@@ -136,7 +173,7 @@ def value_loss(
     Args:
         values: without ``bias`` [sample, 1]. clips: whether values are clipped around ``old_values``.
         coefficient: of the loss in ``gradient`` with respect to values [sample, 1].
-        terms: parts of sums over samples: the gradient with respect to ``bias``, the loss [sample, 2].
+        terms: parts of sums over samples: the gradient with respect to ``bias``, the loss [2, sample].
     """
     i = wp.tid()
     share = 1.0 / wp.float32(values.shape[0])
@@ -153,8 +190,8 @@ def value_loss(
                 slope = 2.0 * near
     slope = slope * coefficient * share
     gradient[i, 0] = gradient.dtype(slope)
-    terms[i, 0] = slope
-    terms[i, 1] = loss * share
+    terms[0, i] = slope
+    terms[1, i] = loss * share
 
 
 @wp.kernel
@@ -233,9 +270,9 @@ def add_overloads() -> None:
     """Name the dtypes of products, so that all kernels are compiled at once."""
     flat, rows = wp.array(dtype=wp.float32), wp.array2d(dtype=wp.float32)
     for T in (wp.float32, wp.bfloat16):
-        own = wp.array2d(dtype=T)
-        add_bias_and_elu.add_overload([own, flat])
-        differentiate_elu.add_overload([own, own, rows])
+        own, words = wp.array2d(dtype=T), wp.array2d(dtype=wp.uint64 if T is wp.float32 else wp.uint32)
+        add_bias_and_elu.add_overload([words, wp.array(dtype=wp.vec2f)])
+        differentiate_elu.add_overload([words, words, wp.array2d(dtype=wp.vec2f)])
         surrogate_loss.add_overload([own, flat, flat, float, float, rows, rows, rows, rows, rows, float, own, rows])
         value_loss.add_overload([own, flat, rows, rows, float, bool, float, own, rows])
         copies = wp.array(dtype=T)

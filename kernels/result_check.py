@@ -11,9 +11,14 @@ LANES = WARP_SIZE  # that share a world on a GPU; one does all elsewhere
 LOOPS = 6  # as warp_spo.Status, which kernels cannot import; a test compares
 ANGLE, ROTATION = 1, 2  # kinds of coordinates: an angle, and the first of four that are a quaternion
 FARTHEST = 1e10  # [rad]; beyond, full turns are subtracted with an error above 1e-6 rad
+FAR = 1e6
+"""Poses and velocities of bodies are finite where the numbers of a finite state are below this [m, rad, m/s, rad/s].
+
+Lengths that would make them infinite have inertias that are not finite, so that the state is not finite either.
+"""
 SQUARES = {wp.float32: (1e-30, 1e38), wp.float64: (1e-290, 1e307)}
 """Between these lies the sum of squares of a quaternion that is normalised as it should be."""
-BAD, BAD_RANGE, BAD_QUATERNION = 1, 2, 4  # bits of what a lane finds
+BAD, BAD_RANGE, BAD_QUATERNION, BEYOND_FAR = 1, 2, 4, 8  # bits of what a lane finds
 
 
 @wp.func_native("""
@@ -31,16 +36,22 @@ def check_results(T: type) -> wp.Kernel:
 
     NOT_FINITE and QUATERNION stay; so do other words as severe where results alone are the matter. Arrays are those
     that a call has written, [world, ...], or None. A gap may be infinite. ``kinds`` [coordinate] is ANGLE, ROTATION
-    or 0.
+    or 0. Poses and velocities are read only where the state is beyond FAR: they are most of what a step writes.
     """
     tiny, least, most = T(NORMAL[T][0]), *(T(x) for x in SQUARES[T])
+
+    @wp.func
+    def bad_of(x: T):
+        return wp.where(wp.isfinite(x), 0, wp.static(BAD)) | wp.where(
+            wp.abs(x) < T(wp.static(FAR)), 0, wp.static(BEYOND_FAR)
+        )
 
     @wp.func
     def bad_of_row(array: wp.array2d[T], world: int, lane: int, lanes: int):
         bad = int(0)
         if array:
             for i in range(lane, array.shape[1], lanes):
-                bad |= wp.where(wp.isfinite(array[world, i]), 0, wp.static(BAD))
+                bad |= bad_of(array[world, i])
         return bad
 
     @wp.func
@@ -53,12 +64,25 @@ def check_results(T: type) -> wp.Kernel:
         return bad
 
     @wp.func
-    def bad_of_state(q: wp.array2d[T], kinds: wp.array[wp.int32], world: int, lane: int, lanes: int):
+    def bad_of_state(
+        q: wp.array2d[T],
+        kinds: wp.array[wp.int32],
+        q_after: wp.array2d[T],
+        rates: wp.array2d[T],
+        world: int,
+        lane: int,
+        lanes: int,
+    ):
         bad = int(0)
-        for i in range(lane, kinds.shape[0], lanes):
-            if kinds[i] == wp.static(ANGLE) and wp.abs(q[world, i]) > T(wp.static(FARTHEST)):
+        for i in range(lane, kinds.shape[0], lanes):  # one loop, so that its four loads wait together
+            kind, x = kinds[i], q[world, i]
+            if q_after:
+                bad |= bad_of(q_after[world, i])
+            if i < rates.shape[1]:  # there are never more dofs than coordinates
+                bad |= bad_of(rates[world, i])
+            if kind == wp.static(ANGLE) and wp.abs(x) > T(wp.static(FARTHEST)):
                 bad |= wp.static(BAD_RANGE)
-            if kinds[i] == wp.static(ROTATION):
+            if kind == wp.static(ROTATION):
                 square = T(0.0)
                 for c in range(4):
                     square += q[world, i + c] * q[world, i + c]
@@ -87,17 +111,18 @@ def check_results(T: type) -> wp.Kernel:
         status_out: wp.array[wp.int32],
     ):
         world, lane = wp.tid() // lanes, wp.tid() % lanes
-        bad = bad_of_state(q, kinds, world, lane, lanes)
-        bad |= bad_of_row(q_after, world, lane, lanes) | bad_of_row(rates, world, lane, lanes)
+        bad = bad_of_state(q, kinds, q_after, rates, world, lane, lanes)
         bad |= bad_of_row(qdd, world, lane, lanes) | bad_of_row(slip, world, lane, lanes)
         bad |= bad_of_row(excess, world, lane, lanes) | bad_of_rows(force, world, lane, lanes)
-        bad |= bad_of_rows(poses, world, lane, lanes) | bad_of_rows(velocities, world, lane, lanes)
         if residual:
             bad |= wp.where(wp.isfinite(residual[world]), 0, wp.static(BAD))
         if gap:
             for i in range(lane, gap.shape[1], lanes):
                 bad |= wp.where(wp.isnan(gap[world, i]), wp.static(BAD), 0)
         bad = any_lane(bad, lanes)
+        if bad & wp.static(BEYOND_FAR):
+            bad |= bad_of_rows(poses, world, lane, lanes) | bad_of_rows(velocities, world, lane, lanes)
+            bad = any_lane(bad, lanes) & ~wp.static(BEYOND_FAR)
         if lane == 0 and bad != 0:
             known = status_out[world]
             if bad & wp.static(BAD_QUATERNION):

@@ -27,6 +27,7 @@ from .shared_rows import (
 )
 from .substeps import (
     STATE,
+    WAIT,
     Before,
     hold_state,
     move_state,
@@ -38,6 +39,7 @@ from .substeps import (
 
 # shared memory that a block may declare: 48 KiB less the share that Warp uses; more is asked for at the launch
 SHARED_BYTES = 46 * 1024
+OWN, READY, HELPERS = 1, 2, 3  # barriers: of the warps with other work than helpers, of what they wait for, of helpers
 WIDE_BYTES = 110 * 1024  # shared memory of a block with long rows, of which two fit into an H100's 228 KiB
 IN_PLACE, STAGED, MAPPED, RELAYED, TILED, DIRECT = "in place", "staged", "mapped", "relayed", "tiled", "direct"
 BY_TABLE = (MAPPED, RELAYED)  # the ways in which a table says which value each entry of a row receives
@@ -94,7 +96,8 @@ class KernelLayout(NamedTuple):
         repeats: the statements are those of a substep, see :mod:`.substeps`.
         spill_slots: the number of values that a thread sets aside in shared memory, as ``ASIDE(i)``.
         near: names and entries of tables that a team copies to shared memory, as ``near_NAME[i]``: loops wait for them.
-        before: code that runs before each substep. helpers: warps of a team that run nothing else.
+        before: code that runs before each substep. helpers: warps of a team that run nothing else, beside the others,
+            which wait for them before they read ``tau_row``.
     """
 
     rows: list[SharedRow]
@@ -121,6 +124,11 @@ class KernelLayout(NamedTuple):
     def team(self) -> int:
         """The threads that work on 32 worlds."""
         return WARP_SIZE * (self.warps + self.helpers)
+
+    @property
+    def wait_for_helpers(self) -> str:
+        """Code with which warps that have other work wait for ``tau_row``, once in a substep."""
+        return f'asm volatile("bar.sync {READY}, {self.team};" ::: "memory");'
 
     @property
     def state(self) -> list[SharedRow]:
@@ -265,21 +273,26 @@ def _cuda_text(layout: KernelLayout, statements: str, T: type) -> list[str]:
 
 def _before_substeps(layout: KernelLayout, places: _Places, statements: str, c: str) -> tuple[list[str], str]:
     """Return code before the first substep, and the statements of a substep behind what runs before each."""
-    barrier, at, parts = _barrier(layout), places.before, []
-    everyone, helpers = layout.warps + layout.helpers, layout.helpers
+    barrier, at, parts, helpers = _barrier(layout), places.before, [], layout.helpers
+    among = f'asm volatile("bar.sync {HELPERS}, {WARP_SIZE * helpers};" ::: "memory");' if helpers else barrier
     for one in layout.before:
-        own = f"constexpr int everyone = {everyone}, helpers = {helpers}; {c}* own = stage + {at};"
-        parts.append([f"{{\n{own}\n{text}\n}}" for text in (one.start, one.beside, one.each)])
+        own = [
+            f"constexpr int helpers = {helpers}, workers = {helpers or layout.warps};",
+            f"const int worker = warp - {layout.warps if helpers else 0};",
+            f"{c}* own = stage + {at};",
+        ]
+        texts = (text.replace(WAIT, among) for text in (one.start, one.beside, one.each))
+        parts.append(["\n".join(["{", *own, text, "}"]) for text in texts])
         at += one.scalars
     starts, beside, each = (list(texts) for texts in zip(*parts, strict=True))
-    first = ["constexpr int substep = -1;", *starts, *(beside if helpers else ())]
-    first = ["{", *first, "}"]
+    first = ["constexpr int substep = -1;", *starts]
     if not helpers:
-        return first, "\n".join([*beside, *each, barrier, statements])
-    own_barrier = f"bar.sync 1, {WARP_SIZE * layout.warps};"
-    statements = statements.replace("bar.sync 0;", own_barrier)
-    main = [f"if (warp < {layout.warps}) {{", statements, "} else {", *beside, "}"]
-    return first, "\n".join([*each, barrier, *main])
+        return ["{", *first, "}"], "\n".join([*beside, *each, barrier, statements])
+    first = [f"if (warp >= {layout.warps}) {{", *first, *beside, "}"]
+    statements = statements.replace("bar.sync 0;", f"bar.sync {OWN}, {WARP_SIZE * layout.warps};")
+    ready = f'asm volatile("bar.arrive {READY}, {layout.team};" ::: "memory");'
+    theirs = [*each, ready, among, *beside]
+    return first, "\n".join([f"if (warp < {layout.warps}) {{", statements, "} else {", *theirs, "}"])
 
 
 def _find_worlds(layout: KernelLayout) -> list[str]:

@@ -12,19 +12,22 @@ SUBSTEPS = "substeps"  # the name of the number of substeps
 # without it the compiler holds rows that stay in registers from substep to substep, and spills others
 FENCE = 'asm volatile("" ::: "memory");'
 SYNC = "__syncthreads();"
+WAIT = "WAIT;"
 STATE = {"q": "q_out", "qd": "out"}  # the rows of the state, and the results that take their place
 
 
 class Before(NamedTuple):
     """Code that writes ``tau_row`` before each substep.
 
-    On CUDA all threads of a team run it, ``everyone`` warps, and rows of tau are in shared memory. Of these warps
-    ``helpers`` have no other work, and may do ``beside`` what the substep before does. A warp has 32 worlds, the thread
+    On CUDA ``workers`` warps of a team run it, ``worker`` is the number of one, and rows of tau are in shared memory.
+    Where there are ``helpers``, they are the workers, and run it beside the others, which wait for it where they read
+    ``tau_row``; otherwise all warps are. At WAIT workers wait for each other. A warp has 32 worlds, the thread
     ``world``; ``own`` is shared memory.
 
     Attributes:
         define: texts of structures that the code uses.
-        start: before the first substep. beside: while the one before runs, or ahead of ``each``. each: the code.
+        start: before the first substep. each: the code. beside: for the next substep, while this one runs; without
+            helpers ahead of ``each``.
         cpu: all of it for the CPU, where ``tau_row`` is that of the caller's array.
         scalars: of shared memory.
     """

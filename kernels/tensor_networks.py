@@ -20,18 +20,22 @@ PITCH = 40  # of the inputs of 32 rows in shared memory: four inputs of eight ro
 MOST_INPUTS, MOST_UNITS = 16, 64
 BOUNDED = ("softsign", "tanh")
 PAIRS = True  # softsign takes one reciprocal for two sums
+TILES = 2  # of 16 rows side by side
+LOOPS = False  # code of hidden layers stands once; not timed yet
 
 
 class NetworkShape(NamedTuple):
     """All of a network that its text depends on.
 
     Attributes:
-        inputs: number of inputs. units: of each hidden layer, multiples of 16. activation: one of BOUNDED.
+        inputs: number of inputs. units: of each hidden layer, a multiple of 16. layers: number of hidden layers.
+        activation: one of BOUNDED.
         scales: powers of two by which the sums of each hidden layer are multiplied; of the first 1.
     """
 
     inputs: int
-    units: tuple[int, ...]
+    units: int
+    layers: int
     activation: str
     scales: tuple[float, ...]
 
@@ -46,13 +50,15 @@ class NetworkShape(NamedTuple):
         return self.rows * PITCH
 
     @property
-    def places(self) -> list[tuple[int, int]]:
-        """Where weights and biases of each layer begin in the array of weights, and behind them its end."""
-        at, found = 0, []
-        for ins, outs in zip((2 * self.rows, *self.units), self.units, strict=False):
-            found.append((at, at + ins // 16 * outs // 8 * 128))
-            at = found[-1][1] + outs
-        return [*found, (at, at + self.units[-1]), (at + self.units[-1] + 1, 0)]
+    def stride(self) -> int:
+        """Words of a hidden layer behind the first, with its biases."""
+        return self.units // 16 * self.units // 8 * 128 + self.units
+
+    @property
+    def places(self) -> tuple[int, int, int]:
+        """Where the first hidden layer, those behind it, and the last layer begin in the array of weights."""
+        between = self.rows // 8 * self.units // 8 * 128 + self.units
+        return 0, between, between + (self.layers - 1) * self.stride
 
 
 PRODUCTS = r"""
@@ -97,86 +103,77 @@ struct on_tensor_cores
 
 
 def define(name: str, shape: NetworkShape) -> str:
-    """Return the definition of ``name::tile(staged, weights, sums)``, which needs PRODUCTS.
+    """Return the definition of ``name::tiles(staged, weights, sums)``, which needs PRODUCTS.
 
-    A warp calls it for 16 rows of inputs in shared memory, [input, PITCH]. Lane 4 g + t gets the sums of the last
-    layer of rows g and g + 8. The code is short on purpose: fetching it takes as long as running it.
+    A warp calls it for TILES of 16 rows of inputs in shared memory, [input, PITCH]. Lane 4 g + t gets the sums of the
+    last layer of rows g, g + 8, and so on, side by side. With LOOPS code of hidden layers stands once: fetching it
+    takes as long as running it.
     """
+    count, steps, hidden = shape.units // 8, shape.units // 16, shape.layers - 1
+    first, between, last = shape.places
+    each = f"for (int m = 0; m < {TILES}; ++m) "
+    every = "#pragma unroll\n" + f"for (int n = 0; n < {count}; ++n) "
     text = [
         f"struct {name} {{",
         *_activation(shape.activation),
-        "static __device__ inline void tile(const float* staged, const float* weights, float* sums)",
+        "static __device__ inline void tiles(const float* staged, const float* weights, float* sums)",
         "{",
         "const int lane = threadIdx.x & 31, t = lane & 3, g = lane >> 2;",
-    ]
-    for layer, units in enumerate(shape.units):
-        first, count = layer == 0, units // 8
-        steps = shape.rows // 8 if first else shape.units[layer - 1] // 16
-        weights, biases = shape.places[layer]
-        y, before = f"y{layer}", f"y{layer - 1}"
-        text += [
-            f"float {y}[{count}][4];",
-            "#pragma unroll",
-            f"for (int n = 0; n < {count}; ++n) {{",
-            f"const float2 b = *(const float2*)(weights + {biases} + 8 * n + 2 * t);",
-            f"{y}[n][0] = {y}[n][2] = b.x; {y}[n][1] = {y}[n][3] = b.y;",
-            "}",
-            "#pragma unroll",
-            f"for (int step = 0; step < {steps}; ++step) {{",
-            "unsigned high[4], low[4];",
-            "#pragma unroll",
-            "for (int i = 0; i < 4; ++i) {",
-        ]
-        if first:
-            text += [
-                f"const float x = staged[(8 * step + t + 4 * (i / 2)) * {PITCH} + g + 8 * (i & 1)];",
-                "high[i] = __float_as_uint(x) & 0xffffe000u;  // NaN and infinity stay what they are",
-                "low[i] = __float_as_uint(x - __uint_as_float(high[i])) + 0x1000u;  // rounded when it is read",
-            ]
-        else:
-            text += [
-                f"const float* x = {before}[2 * step + i / 2] + 2 * (i & 1);",
-                "float a, b;",
-                "high[i] = on_tensor_cores::to_half(x[0], x[1]);",
-                "on_tensor_cores::from_half(high[i], a, b);",
-                "low[i] = on_tensor_cores::to_half(x[0] - a, x[1] - b);",
-            ]
-        text += [
-            "}",
-            f"uint4 w[{count}];",
-            "#pragma unroll",
-            f"for (int n = 0; n < {count}; ++n)"
-            f" w[n] = ((const uint4*)(weights + {weights}))[(step * {count} + n) * 32 + lane];",
-        ]
-        product = "on_tensor_cores::" + ("tf32" if first else "half")
-        for part, b0, b1 in (("low", "x", "y"), ("high", "z", "w"), ("high", "x", "y")):
-            text += [
-                "#pragma unroll",
-                f"for (int n = 0; n < {count}; ++n) {product}({y}[n], {part}, w[n].{b0}, w[n].{b1});",
-            ]
-        text += [
-            "}",
-            "#pragma unroll",
-            f"for (int n = 0; n < {count}; ++n) {{",
-            f"activate({y}[n][0], {y}[n][1], {shape.scales[layer]!r}f);",
-            f"activate({y}[n][2], {y}[n][3], {shape.scales[layer]!r}f);",
-            "}",
-        ]
-    last, bias = shape.places[len(shape.units)]
-    y, count = f"y{len(shape.units) - 1}", shape.units[-1] // 8
-    text += [
-        "sums[0] = sums[1] = 0.0f;",
+        f"float y[{TILES}][{count}][4];",
+        *_start(every, each, f"weights + {first + shape.rows // 8 * count * 128}"),
         "#pragma unroll",
-        f"for (int n = 0; n < {count}; ++n) {{",
+        f"for (int step = 0; step < {shape.rows // 8}; ++step) {{",
+        f"unsigned high[{TILES}][4], low[{TILES}][4];",
+        "#pragma unroll",
+        each,
+        "for (int i = 0; i < 4; ++i) {",
+        f"const float x = staged[(8 * step + t + 4 * (i / 2)) * {PITCH} + 16 * m + g + 8 * (i & 1)];",
+        "high[m][i] = __float_as_uint(x) & 0xffffe000u;  // NaN and infinity stay what they are",
+        "low[m][i] = __float_as_uint(x - __uint_as_float(high[m][i])) + 0x1000u;  // rounded when it is read",
+        "}",
+        *_multiply("tf32", every, each, f"weights + {first}", count),
+        "}",
+        f"#pragma unroll {1 if LOOPS else shape.layers}",
+        f"for (int layer = 0; layer < {shape.layers}; ++layer) {{",
+        f"const float factor = {_by_layer(shape)};",
+        every + each + "{",
+        "activate(y[m][n][0], y[m][n][1], factor);",
+        "activate(y[m][n][2], y[m][n][3], factor);",
+        "}",
+        f"if (layer == {hidden}) break;",
+        f"unsigned highs[{TILES}][{steps}][4], lows[{TILES}][{steps}][4];",
+        "#pragma unroll",
+        f"for (int k = 0; k < {4 * steps}; ++k) {each}{{",
+        "const float* x = y[m][k / 2] + 2 * (k & 1);",
+        "float a, b;",
+        "unsigned& high = highs[m][k / 4][k % 4];",
+        "high = on_tensor_cores::to_half(x[0], x[1]);",
+        "on_tensor_cores::from_half(high, a, b);",
+        "lows[m][k / 4][k % 4] = on_tensor_cores::to_half(x[0] - a, x[1] - b);",
+        "}",
+        f"const float* own = weights + {between} + layer * {shape.stride};",
+        *_start(every, each, f"own + {steps * count * 128}"),
+        "#pragma unroll",
+        f"for (int step = 0; step < {steps}; ++step) {{",
+        f"unsigned high[{TILES}][4], low[{TILES}][4];",
+        "#pragma unroll",
+        f"for (int i = 0; i < 4; ++i) {each}high[m][i] = highs[m][step][i], low[m][i] = lows[m][step][i];",
+        *_multiply("half", every, each, "own", count),
+        "}",
+        "}",
+        f"for (int i = 0; i < {2 * TILES}; ++i) sums[i] = 0.0f;",
+        every + "{",
         f"const float2 w = *(const float2*)(weights + {last} + 8 * n + 2 * t);",
-        f"sums[0] = __fmaf_rn({y}[n][0], w.x, __fmaf_rn({y}[n][1], w.y, sums[0]));",
-        f"sums[1] = __fmaf_rn({y}[n][2], w.x, __fmaf_rn({y}[n][3], w.y, sums[1]));",
+        each + "{",
+        "sums[2 * m] = __fmaf_rn(y[m][n][0], w.x, __fmaf_rn(y[m][n][1], w.y, sums[2 * m]));",
+        "sums[2 * m + 1] = __fmaf_rn(y[m][n][2], w.x, __fmaf_rn(y[m][n][3], w.y, sums[2 * m + 1]));",
+        "}",
         "}",
         "#pragma unroll",
-        "for (int i = 0; i < 2; ++i) {",
+        f"for (int i = 0; i < {2 * TILES}; ++i) {{",
         "sums[i] += __shfl_xor_sync(0xffffffffu, sums[i], 1);",
         "sums[i] += __shfl_xor_sync(0xffffffffu, sums[i], 2);",
-        f"sums[i] += weights[{bias}];",
+        f"sums[i] += weights[{last + shape.units}];",
         "}",
         "}",
         "};",
@@ -184,18 +181,46 @@ def define(name: str, shape: NetworkShape) -> str:
     return "\n".join(text)
 
 
+def _start(every: str, each: str, biases: str) -> list[str]:
+    """Return code in which sums begin as biases."""
+    return [
+        every + "{",
+        f"const float2 b = *(const float2*)({biases} + 8 * n + 2 * t);",
+        each + "{ y[m][n][0] = y[m][n][2] = b.x; y[m][n][1] = y[m][n][3] = b.y; }",
+        "}",
+    ]
+
+
+def _multiply(product: str, every: str, each: str, weights: str, count: int) -> list[str]:
+    """Return code that adds the three products of a step, of parts ``high`` and ``low``, to the sums."""
+    loads = f"w[n] = ((const uint4*)({weights}))[(step * {count} + n) * 32 + lane];"
+    parts = (("low", "x", "y"), ("high", "z", "w"), ("high", "x", "y"))
+    call = f"on_tensor_cores::{product}(y[m][n], {{}}[m], w[n].{{}}, w[n].{{}});".format
+    return [f"uint4 w[{count}];", every + loads, *(every + each + call(*part) for part in parts)]
+
+
+def _by_layer(shape: NetworkShape) -> str:
+    """Return C++ for what :func:`_activation` needs of the scale of ``layer``."""
+    factors = [1.0 / scale if shape.activation == "tanh" else scale / SCALE for scale in shape.scales]
+    *some, last = (f"{each!r}f" for each in factors)
+    return "".join(f"layer == {layer} ? {each} : " for layer, each in enumerate(some)) + last
+
+
 def _activation(name: str) -> list[str]:
-    """Return the definition of ``activate(a, b, scale)``: two sums, times ``scale``, become outputs times SCALE."""
-    start = "static __device__ inline void activate(float& a, float& b, float scale) {"
+    """Return the definition of ``activate(a, b, factor)``: two sums become outputs times SCALE.
+
+    Sums come times a scale; ``factor`` is that over SCALE, for tanh 1 over it.
+    """
+    start = "static __device__ inline void activate(float& a, float& b, float factor) {"
     if name == "tanh":
-        return [start, f"a = {SCALE!r}f * tanhf(a * (1.0f / scale)); b = {SCALE!r}f * tanhf(b * (1.0f / scale)); }}"]
+        return [start, f"a = {SCALE!r}f * tanhf(a * factor); b = {SCALE!r}f * tanhf(b * factor); }}"]
     if not PAIRS:
-        one = "{0} *= on_tensor_cores::over(__fmaf_rn(fabsf({0}), {1!r}f, scale * {1!r}f));"
+        one = "{0} *= on_tensor_cores::over(__fmaf_rn(fabsf({0}), {1!r}f, factor));"
         return [start, one.format("a", 1 / SCALE), one.format("b", 1 / SCALE), "}"]
     return [
         start,
-        f"const float c = __fmaf_rn(fabsf(a), {1 / SCALE!r}f, scale * {1 / SCALE!r}f);",
-        f"const float d = __fmaf_rn(fabsf(b), {1 / SCALE!r}f, scale * {1 / SCALE!r}f);",
+        f"const float c = __fmaf_rn(fabsf(a), {1 / SCALE!r}f, factor);",
+        f"const float d = __fmaf_rn(fabsf(b), {1 / SCALE!r}f, factor);",
         "const float r = on_tensor_cores::over(c * d);  // one reciprocal for two: there are few units for it",
         "a *= r * d; b *= r * c; }",
     ]

@@ -6,7 +6,8 @@ A name is a test, or one case of a parametrized test, as pytest writes it behind
 SLOW_CASES = (
     "test_actuator_nets.py::test_products_of_tensor_cores_are_as_accurate_as_float32[sizes1-tanh-lags1-2]",
     "test_actuator_nets.py::test_products_of_tensor_cores_are_as_accurate_as_float32[sizes2-tanh-lags2-1]",
-    "test_actuator_nets.py::test_the_kernel_of_the_step_has_the_bits_of_kernels_apart",
+    "test_actuator_nets.py::test_the_kernel_of_the_step_has_the_bits_of_kernels_apart[False]",
+    "test_actuator_nets.py::test_the_kernel_of_the_step_has_the_bits_of_kernels_apart[True]",
     "test_adjoints.py::test_forward_dynamics[limbs-float64-segment]",
     "test_adjoints.py::test_forward_dynamics[limbs-float64-tree]",
     "test_benchmarks.py::test_capabilities_are_compared_with_references",

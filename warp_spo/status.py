@@ -50,7 +50,7 @@ class Status(enum.IntEnum):
 
     @property
     def advice(self) -> str:
-        """What to do about it, in one or two sentences."""
+        """The way out, in one or two sentences."""
         return _ADVICE[self]
 
     @property

@@ -204,9 +204,9 @@ class Run:
 def compile_solvers(runs: list[Run], variants: list[tuple[int, int, int | None]], device: wp.Device) -> float:
     """Compile the solvers side by side; return the seconds that it took."""
     start = time.perf_counter()
-    modules = {run.solver(*each).solver.module for run in runs for each in variants}
+    solvers = {part for run in runs for each in variants for part in run.solver(*each).solvers}
     with ThreadPoolExecutor() as pool:
-        list(pool.map(lambda module: module.load(device, block_dim=joint_space.BLOCK), modules))
+        list(pool.map(lambda part: part[0].module.load(device, block_dim=part[2]), solvers))
     return time.perf_counter() - start
 
 

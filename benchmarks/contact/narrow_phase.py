@@ -239,7 +239,7 @@ def pair_errors(
 
 def count_strays(pair: PosedPair, points: np.ndarray, there: np.ndarray) -> int:
     """Return how many points lie farther outside of a shape than half their depth and ON_BOTH allow."""
-    n, outside = pair._sampled(400), np.zeros(points.shape[:2], dtype=bool)
+    n, outside = pair.sample_directions(400), np.zeros(points.shape[:2], dtype=bool)
     for shape, turn, at in ((pair.a, pair.turn_a, 0.0 * pair.place), (pair.b, pair.turn_b, pair.place)):
         reach = shape.reach(n @ turn)
         local = points[..., :3] - at[:, None]

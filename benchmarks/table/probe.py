@@ -14,12 +14,15 @@ import warp as wp
 
 DT = 2e-3  # [s]
 KE, KD = 200.0, 20.0  # drives of a step [N m/rad, N m s/rad]
+FEET = "ankle_roll_link"  # how labels of the bodies end at which the inertia is asked for
 ROW, MOST_CALLS = 3e-3, 256  # calls that are timed together take so long [s], or are so many
 REPEATS, WARM_UP = 15, 0.1  # timed rows; time of calls before them [s]
 
 
 def call_of(case, spo, device):
     """Return a function that launches a case, and the arrays that it writes."""
+    if case["op"] == "solver_step":
+        return solver_call(case, device)
     scene = spo.load(case["urdf"], floating=case["floating"])
     if case["op"] == "step":
         driven = np.concatenate([np.full(hinge.dof_count, hinge.kind != "free") for hinge in scene.hinges])
@@ -38,9 +41,34 @@ def call_of(case, spo, device):
     if case["op"] == "mass_matrix":
         mass = dyn.mass_matrix(q)
         return (lambda: dyn.mass_matrix(q, out=mass)), [mass]
+    if case["op"] == "operational_inertia_inverse":
+        feet = [label for label in scene.body_labels if label.endswith(FEET)]
+        inverse = dyn.operational_inertia_inverse(q, feet)
+        return (lambda: dyn.operational_inertia_inverse(q, feet, out=inverse)), [inverse]
     result = wp.empty_like(qd)
     call = getattr(dyn, case["op"])
     return (lambda: call(q, qd, tau, out=result)), [result]
+
+
+def solver_call(case, device):
+    """Return a function that launches SolverSPO's step of a Newton model with drives, and the arrays that it writes."""
+    import newton
+
+    from warp_spo.newton import SolverSPO
+
+    one, many = newton.ModelBuilder(), newton.ModelBuilder()
+    one.add_urdf(case["urdf"], floating=case["floating"])
+    dofs = len(one.joint_target_ke)
+    one.joint_target_ke[:], one.joint_target_kd[:] = [KE] * dofs, [KD] * dofs
+    one.joint_target_mode[:] = [int(newton.JointTargetMode.POSITION)] * dofs
+    many.replicate(one, case["worlds"])
+    model = many.finalize(device=device)
+    solver, now, after, control = SolverSPO(model), model.state(), model.state(), model.control()
+    low, high = model.joint_limit_lower.numpy(), model.joint_limit_upper.numpy()
+    anywhere = low + (high - low) * np.random.default_rng(0).uniform(0.05, 0.95, (2, len(low)))
+    start, control.joint_target_q = (wp.array(q, dtype=wp.float32, device=device) for q in anywhere)
+    wp.copy(now.joint_q, start)
+    return (lambda: solver.step(now, after, control, None, DT)), [after.joint_q, after.joint_qd]
 
 
 def seconds_of(call, device):

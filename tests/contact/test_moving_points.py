@@ -108,7 +108,7 @@ def test_the_kernel_of_a_hull_is_the_dense_step(ground, device):
 
 @pytest.mark.parametrize("kind", ROUND)
 def test_paths_bend_as_heights_do(kind):
-    """What a point at rates that stay rises beyond its speed: second differences of its height."""
+    """Acceleration at which a point rises at rates that stay: second differences of its height."""
     scene, t = scene_of(kind), 1e-4
     for state in np.random.default_rng(1).normal(size=(6, 13)):
         q, qd = np.concatenate([state[:3], state[3:7] / np.linalg.norm(state[3:7])]), 5.0 * state[7:]

@@ -1,18 +1,23 @@
 """Learned actuators in environments beside torch's evaluation of the same network; their gradients by differences."""
 
+import dataclasses
 import itertools
 
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 import warp_spo as spo
 from support.env_scenes import FEET, walker_q, walker_scene
 from support.host_lanes import run_network
+from warp_spo.dynamics import dynamics
 from warp_spo.env import Env, actions, events, observations, rewards
 from warp_spo.env.actuator_nets import ActuatorNetwork
 from warp_spo.env.compile import actuator_launches, tensor_weights
-from warp_spo.kernels import tensor_networks
+from warp_spo.execution.device_facts import MEASURED
+from warp_spo.kernels import native, tensor_networks
+from warp_spo.runtime import launches
 
 JOINTS = 8
 SAME = 1e-6  # of the largest torque: float32, sums of 32 terms
@@ -37,9 +42,16 @@ def network_of(*sizes, activation="softsign", **more):
     return ActuatorNetwork(weights, [rng.normal(size=len(w)) for w in weights], activation, **more)
 
 
-def walker(network, worlds=4, device="cpu", **changes):
-    """Return a walker whose joints have learned actuators and no servos."""
+def rubbing_scene():
+    """A walker in the air whose joints have friction, so that a step has guesses."""
     scene = walker_scene(delay=0)
+    hinges = [scene.hinges[0], *(dataclasses.replace(each, friction=0.3) for each in scene.hinges[1:])]
+    return spo.Scene(scene.bodies, hinges, actuators=scene.actuators)
+
+
+def walker(network, worlds=4, device="cpu", scene=None, **changes):
+    """Return a walker whose joints have learned actuators and no servos."""
+    scene = walker_scene(delay=0) if scene is None else scene
     options = {
         "actions": network and actions.ActuatorNet(network, scale=0.5),
         "observations": {"actor": [observations.joint_position(), observations.joint_velocity()]},
@@ -140,21 +152,61 @@ def test_what_tensor_cores_do_not_evaluate():
         assert tensor_weights.shape_of(network) is None
 
 
-def test_the_kernel_of_the_step_has_the_bits_of_kernels_apart(monkeypatch, device):
+@pytest.mark.parametrize("rubs", [False, True])
+def test_the_kernel_of_the_step_has_the_bits_of_kernels_apart(rubs, monkeypatch, device):
     """Two networks, histories, starts anew, limits, mean forces; other worlds beside change nothing."""
     first, other = network_of(4, 16, 1, input_idx=(0, 2), torque_scale=9.0), network_of(2, 8, 1, input_idx=(3,))
     acts = [actions.ActuatorNet(first, "joint_[1-6]"), actions.ActuatorNet(other, "joint_[78]")]
-    seen = {"actor": [observations.joint_position(), lambda w: w.joint_force, lambda w: w.contact_force[:, 2]]}
+    seen = [observations.joint_position(), lambda w: w.joint_force]
+    more = {"observations": {"actor": seen if rubs else [*seen, lambda w: w.contact_force[:, 2]]}}
+    more |= {"scene": rubbing_scene()} if rubs else {}
     found = {}
     for name, kinds, worlds in (("apart", (), 40), ("joined", ("cpu", "cuda"), 40), ("more", ("cpu", "cuda"), 70)):
         monkeypatch.setattr(actuator_launches, "JOINED_ON", kinds)
-        env = walker(None, worlds, str(device), actions=acts, observations=seen, granularity="segment")
+        env = walker(None, worlds, str(device), actions=acts, granularity="segment", **more)
         assert (env._networks is None) == (name != "apart")
         generator = torch.Generator().manual_seed(1)
         given = [torch.randn(70, JOINTS, generator=generator)[:worlds].to(env.device) for _ in range(30)]
         found[name] = torch.stack([torch.cat([env.step(x)[0]["actor"], env.q, env.qd], dim=1)[:40] for x in given])
     assert torch.equal(found["apart"], found["joined"]) and torch.equal(found["joined"], found["more"])
     assert torch.isfinite(found["apart"]).all() and found["apart"].abs().max() > 1.0
+
+
+def step_text(monkeypatch, **changes):
+    """Return the text of the kernel of a step with a network as for a GPU; nothing is compiled or launched."""
+    choose, kernel, texts = dynamics.plans.choose, native.kernel, []
+
+    def record(name, text, *more, **options):
+        texts.append(text)
+        return kernel(name, text, *more, **options)
+
+    monkeypatch.setattr(
+        dynamics.plans, "choose", lambda scene, worlds, _, *more: choose(scene, worlds, MEASURED, *more)
+    )
+    monkeypatch.setattr(native, "kernel", record)
+    monkeypatch.setattr(actuator_launches, "JOINED_ON", ("cpu",))
+    monkeypatch.setattr(actuator_launches, "_has_tensor_cores", lambda _: True)
+    for module in (wp, launches):
+        monkeypatch.setattr(module, "launch", lambda *_, **__: None)
+    walker(network_of(6, 16, 1, torque_scale=9.0), graph=False, **changes).step(torch.zeros(4, JOINTS))
+    (found,) = [text for text in texts if "network_0::tiles" in text and "substeps_row" in text]
+    return found.partition("const long long world = thread;")[0]  # what follows is for a CPU
+
+
+def test_limbs_wait_for_torques_once_before_they_read_them(monkeypatch):
+    """Where helpers compute torques beside them: in the first pass of a substep, in each text of limbs."""
+    text = step_text(monkeypatch)
+    assert "helpers = 4" in text and "__syncthreads_or" not in text
+    parts = text.split('if (turn == 0) asm volatile("bar.sync 2, 256;" ::: "memory");')
+    before, *others = (part.split("tau_row = ", 1)[-1].count("= tau_row[") for part in parts)
+    assert before == 0 and len(others) == 1 and others[0] == 2 + 6  # of a limb that all four share, and of the base
+    assert text.count("bar.arrive 2, 256;") == 1
+
+
+def test_no_warps_help_where_all_of_a_block_vote(monkeypatch):
+    """Guesses about friction are right when no thread of the block says otherwise."""
+    text = step_text(monkeypatch, scene=rubbing_scene())
+    assert "__syncthreads_or" in text and "helpers = 0" in text and "bar.sync 2" not in text
 
 
 def test_limits_and_means_of_contact_forces():

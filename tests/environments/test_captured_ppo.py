@@ -177,6 +177,24 @@ def test_a_number_that_is_none_reaches_the_guard_of_fused_updates():
         assert torch.equal(state(alg), before)
 
 
+def test_a_first_update_that_fails_leaves_adam_where_it_is():
+    """A graph is captured after the first update; it would start Adam anew at each replay if Adam had no numbers."""
+    env = cart_env(worlds=4, seed=3)
+    alg, fresh = construct(CapturedPPO, env), construct(CapturedPPO, env)
+    collect(alg, env, env.get_observations())
+    alg.storage.returns[0, 0] = torch.nan
+    with pytest.raises(FloatingPointError, match="value"):
+        alg.update()
+    numbers = [x for each in alg.optimizer.state.values() for x in each.values()]
+    assert len(numbers) == 3 * len(list(alg.actor.parameters()) + list(alg.critic.parameters()))
+    assert not any(x.any() for x in numbers)
+    learn(alg, env)
+    learn(fresh, env)
+    assert torch.equal(state(alg), state(fresh)) and alg.learning_rate == fresh.learning_rate
+    after = [x for each in alg.optimizer.state.values() for x in each.values()]
+    assert all(x is y for x, y in zip(numbers, after, strict=True))
+
+
 @pytest.mark.parametrize(
     "options, why",
     [

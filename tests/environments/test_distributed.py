@@ -19,6 +19,7 @@ from warp_spo.env.tasks import task
 pytestmark = pytest.mark.slow
 WORLDS, ITERATIONS = 16, 2
 MEAN = 1e-6  # of float32 gradients, against their largest entry
+FUSED = 1e-4  # of weights after two updates, whose sums have another order
 
 
 def free_port():
@@ -27,8 +28,9 @@ def free_port():
         return one.getsockname()[1]
 
 
-def learn(rank, size, port, folder):
+def learn(rank, size, port, folder, fuses=None):
     """Train the cart-pole in process ``rank``; leave starts, gradients before and after averaging, and weights."""
+    learning.CapturedPPO.fuses = fuses
     os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(size)}
     os.environ |= {"MASTER_ADDR": "localhost", "MASTER_PORT": str(port)}
     torch.set_num_threads(1)
@@ -66,6 +68,21 @@ def test_two_processes_learn_one_policy(tmp_path):
     assert a["rate"] == b["rate"] and a["state"].keys() == b["state"].keys()
     assert all(value.equal(b["state"][name]) for name, value in a["state"].items())  # normalisers, too
     assert sorted(path.name for path in tmp_path.glob("model_*.pt")) == ["model_0.pt", f"model_{ITERATIONS - 1}.pt"]
+
+
+def test_fused_updates_of_two_processes_are_those_of_torch(tmp_path):
+    found = {}
+    for fuses in (False, True):
+        folder = tmp_path / str(fuses)
+        folder.mkdir()
+        processes.start_processes(learn, (2, free_port(), folder, fuses), nprocs=2, start_method="spawn")
+        found[fuses] = [torch.load(folder / f"found_{rank}.pt", weights_only=True) for rank in range(2)]
+    (torch_s, _), (ours, others) = found[False], found[True]
+    assert not ours["own"]  # averaged by other code
+    assert ours["rate"] == others["rate"] == pytest.approx(torch_s["rate"], rel=1e-6)
+    assert all(value.equal(others["state"][name]) for name, value in ours["state"].items())
+    expected, own = (torch.cat([x.double().ravel() for x in each["state"].values()]) for each in (torch_s, ours))
+    assert (own - expected).norm() < FUSED * expected.norm()
 
 
 def test_a_device_for_each_process_is_refused(capsys):

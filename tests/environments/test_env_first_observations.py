@@ -16,7 +16,7 @@ import torch
 import warp_spo as spo
 from warp_spo.env import Env, TorchTerm, World, actions, commands, events, observations, rays, rewards, terminations
 from warp_spo.env.compile.step_kernels import Tracing
-from warp_spo.env.tasks import velocity
+from warp_spo.env.tasks import ant, cartpole, panda_reach, velocity
 from warp_spo.reference import Dense
 
 FEET, PAIRS = "leg.", ((0, 1), (1, 0))
@@ -25,6 +25,7 @@ TABLE = np.arange(8.0).reshape(4, 2) ** 2
 FLOAT32 = 3e-5  # of numbers of a size: gaps of bodies 1 m away, drives of 50 N m/rad at rounded angles
 DT = 5e-3  # of the environment's steps of the dynamics [s]
 STEPS = 55  # one more than a period of one second and a few
+TOE = (0.0, 0.0, -0.2)  # place of the site "hand" on the second leg [m]
 LOW, SHARE, WIDE = -1.2, 0.5, 0.4  # lower limits [rad], share of joint_limits, deviation of posture
 
 
@@ -39,9 +40,8 @@ def scene():
     servo = spo.Actuator(1, gain=40.0, bias=(0, -40.0, -1.0), gear=1.5, label="servo")
     touches = [spo.Contact(1 + i, sphere=((0, 0, -0.2), 0.02)) for i in (0, 1)]
     touches.append(spo.Contact(0, point=(0.1, 0, -0.05)))
-    return spo.Scene(
-        [trunk, *legs], [spo.Hinge("free", -1, 0, label="base"), *hips], actuators=[servo], contacts=touches
-    )
+    hinges, hand = [spo.Hinge("free", -1, 0, label="base"), *hips], {"hand": (2, (*TOE, 0, 0, 0, 1))}
+    return spo.Scene([trunk, *legs], hinges, actuators=[servo], contacts=touches, sites=hand)
 
 
 @functools.cache
@@ -95,6 +95,12 @@ class Truth:
         """Pose, velocity and angular velocity of a body."""
         rates = self.dense.jacobian([body])[0] @ self.qd
         return self.dense.body_matrix[body], rates[:3], rates[3:]
+
+    @property
+    def hand(self):
+        """Position of the site of the second leg, inertial axes."""
+        matrix = self.frame(2)[0]
+        return matrix[:3, :3] @ TOE + matrix[:3, 3]
 
     @property
     def rates(self):
@@ -190,7 +196,7 @@ def beyond_limits(t):
 
 def command_truth(t):
     missing = (t.asked - t.heading + np.pi) % (2.0 * np.pi) - np.pi
-    return [*t.command[:2], t.moves * np.clip(0.5 * missing, -1.0, 1.0)]
+    return np.array([*t.command[:2], t.moves * np.clip(0.5 * missing, -1.0, 1.0)])
 
 
 def ray_truth(t):
@@ -306,6 +312,19 @@ READY = {
     velocity.trot: (velocity.trot(FEET, PAIRS, None), lambda t: 0.5),
     velocity.step_phase: (velocity.step_phase(0.7), lambda t: [0.0, 0.0 if t.still else 1.0]),
     velocity.in_step: (velocity.in_step(FEET, 0.7), lambda t: 0.0 if t.still else 0.5),
+    ant.height: lambda t: t.q[2],
+    ant.direction: lambda t: [np.sin(t.heading), np.cos(t.heading)],
+    ant.speed: lambda t: min(t.qd[0], ant.ENOUGH),
+    ant.drift: lambda t: t.qd[1] ** 2,
+    ant.straight: lambda t: np.exp(-5.0 * (t.gravity[:2] ** 2).sum()) * 0.5 * (1.0 + np.cos(t.heading)),
+    cartpole.angle: lambda t: [np.sin(t.q[1]), np.cos(t.q[1])],
+    cartpole.upright: lambda t: 0.5 * (1.0 + np.cos(t.q[1])) * (0.3 + 0.7 * np.exp(-((t.q[0] / 0.8) ** 2))),
+    cartpole.balance: lambda t: np.exp(-10.0 * (1.0 - np.cos(t.q[1])) - (t.qd[:2] ** 2).sum() / 8.0),
+    cartpole.effort: lambda t: 0.0,
+    panda_reach.missing: lambda t: command_truth(t) - t.hand,
+    panda_reach.distance: lambda t: np.linalg.norm(command_truth(t) - t.hand),
+    panda_reach.near: (
+        panda_reach.near(0.2), lambda t: 1.0 / (1.0 + ((command_truth(t) - t.hand) ** 2).sum() / 0.04)),
 }  # fmt: skip
 """Ready terms, or what returns them with the term, and the truth."""
 OTHERS = {
@@ -314,6 +333,9 @@ OTHERS = {
     terminations: (),
     velocity: ("observed", "starts", "randomisation"),
     rays: ("dot", "cast", "ring"),
+    ant: ("build", "measure"),
+    cartpole: ("build", "measure"),
+    panda_reach: ("build", "measure"),
 }
 """Public functions of these modules that are no terms."""
 

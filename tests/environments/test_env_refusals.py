@@ -42,6 +42,10 @@ ENVIRONMENTS = [
     (dict(actions=actions.Effort("slide", scale=NAN)), "scale is nan; expected finite numbers"),
     (dict(events=events.joints()), r"events is Reset.*expected a list"),
     (dict(events=[events.servo_gains()]), "an event changes actuator_gain, of which the scene has none"),
+    (
+        dict(observations={"a": [TorchTerm(Q, name="b/c")], "a/b": [TorchTerm(Q, name="c")]}),
+        "two terms are counted as observation/a/b/c; expected other names",
+    ),
     (dict(events=[events.encoder_bias(0.1, "slide"), events.encoder_bias(0.1, "hinge")]), "two encoder_bias"),
 ]
 
@@ -258,6 +262,61 @@ def test_an_environment_made_in_inference_mode_works_outside():
     worlds.reset(options={"reset_mask": np.ones(8, bool)})
     env.q[0] = 0.1
     env.load_state_dict(env.state_dict())
+
+
+def test_tensors_that_are_written_require_no_grad():
+    """The refusal names where they were written; the environment goes on with the numbers of its own tensors."""
+    drawn = events.randomise("joint_damping", (1.0, 1.0), how="set")
+    remembers = {"actor": [lambda w: w.memory("own", 1, reset=None)], "critic": [lambda w: w.value("joint_damping")[0]]}
+    env = cart_env(3, events=[drawn], observations=remembers, commands=commands.Uniform(ranges=((0.0, 0.0),)))
+    asks = lambda *shape: torch.full(shape, 2.0, requires_grad=True)  # noqa: E731
+    damping = env.values["joint_damping"]
+    refused = "x requires grad; .*x.detach"
+    with pytest.raises(ValueError, match=rf"env.values\['joint_damping'\] = x: {refused}"):
+        env.values["joint_damping"] = asks(3, 2)
+    with pytest.raises(ValueError, match=f"env.command = x: {refused}"):
+        env.command = asks(3, 1)
+    with pytest.raises(ValueError, match=f"env.command: {refused}"):
+        env.command[1:].copy_(asks(2, 1))
+    assert (damping == 1.0).all() and not env.command.any()
+    for write, name in [
+        (lambda: damping[1:, 0].copy_(asks(2)), r"env.values\['joint_damping'\]"),
+        (lambda: env.q.__setitem__(0, 0.01 * asks(2)), "env.q"),
+        (lambda: env.qd.mul_(asks(3, 2)), "env.qd"),
+        (lambda: env.memory("own")[:].add_(asks(3, 1)), r"env.memory\(...\)"),
+    ]:
+        write()
+        with pytest.raises(ValueError, match=f"Env: x requires grad, .* into {name}; expected x.detach"):
+            env.step(torch.zeros(3, 1))
+        observed, reward, _, _ = env.step(torch.zeros(3, 1))
+        assert not reward.requires_grad and not env.state_dict()["memory"].requires_grad
+    assert observed["critic"][2].item() == 2.0 and observed["actor"].tolist() == [[2.0]] * 3
+    env.load_state_dict({name: x.requires_grad_(x.is_floating_point()) for name, x in env.state_dict().items()})
+    with torch.no_grad():
+        env.q[:] = 0.01 * asks(3, 2)
+    env.values["joint_damping"] = asks(3, 2).detach()
+    assert env.step(torch.zeros(3, 1))[0]["critic"].tolist() == [[2.0]] * 3
+
+
+def test_values_that_are_written_are_numbers():
+    env = cart_env(3, events=[events.randomise("joint_damping", (1.0, 1.0), how="set")])
+    for x, words in [
+        (np.ones((2, 2)), r"x is torch.float64 \(2, 2\); expected real numbers \(3, 2\)"),
+        (np.ones((1, 3, 2)), r"x is torch.float64 \(1, 3, 2\); expected"),
+        ("a", "x is 'a'; expected real numbers"),
+        (None, "x is None; expected real numbers"),
+        ([[1, 2], [3]], "expected real numbers"),
+        (torch.ones(3, 2, dtype=torch.complex64), "x is torch.complex64"),
+        (torch.ones(3, 2).to_sparse(), "x is of layout"),
+        (torch.ones(3, 2, device="meta"), "x is on the device meta"),
+    ]:
+        with pytest.raises((ValueError, TypeError), match=rf"env.values\['joint_damping'\] = x: .*{words}"):
+            env.values["joint_damping"] = x
+    with pytest.raises(KeyError, match=r"no event changes 'body_mass'; expected one of \[joint_damping\].*randomise"):
+        env.values["body_mass"] = 1.0
+    assert (env.values["joint_damping"] == 1.0).all() and "body_mass" not in env.values
+    env.values["joint_damping"] = [2.0, 3.0]
+    assert env.values["joint_damping"].tolist() == [[2.0, 3.0]] * 3
 
 
 PARTS = [

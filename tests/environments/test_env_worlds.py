@@ -9,7 +9,7 @@ import torch
 import warp_spo as spo
 import warp_spo.env as envs
 from support.env_scenes import FEET, cart_env, cart_scene, walker_env, walker_q, walker_scene
-from warp_spo.env import TorchTerm, actions, commands, evaluation, events, observations, rewards
+from warp_spo.env import TorchTerm, actions, commands, curricula, evaluation, events, observations, rewards
 from warp_spo.env.tasks import velocity
 from warp_spo.recursions.contact import coupled
 from warp_spo.reference import Dense
@@ -128,6 +128,37 @@ def test_the_time_in_events_is_that_of_their_world():
     assert (found[:19, 1] == 1.0).all() and found[19, 1] == pytest.approx(0.4)
 
 
+def test_frames_in_resets_and_commands_are_those_of_the_state_that_starts():
+    """A reset that has placed the pole, and a command about it, read where it is now and not where it was."""
+
+    def place(w):
+        w.q[0], w.q[1] = w.uniform(-0.3, 0.3), w.uniform(-0.5, 0.5)
+        w.keep("place", [*w.frame("pole").position, *w.jacobian("pole")[0]])
+
+    class Above(commands.Uniform):
+        def draw(self, w, done):
+            return {"command": [w.frame("pole").position[0] + w.uniform(1.0, 1.0)]}
+
+    env = cart_env(
+        4, events=[events.Reset(place)], commands=Above(((0.0, 2.0),)), terminations={"out": lambda w: w.q[0] > 0.9},
+        observations={"a": [lambda w: w.memory("place", 5, reset=None), lambda w: w.command]},
+    )  # fmt: skip
+    dyn = spo.Dynamics(env.scene, 4, "cpu", "float64")
+
+    def check(observed, worlds):
+        place = dyn.frame_poses(env.q.double(), ["pole"])[:, 0, :3]
+        wanted = torch.cat([place, dyn.jacobian(env.q.double(), ["pole"])[:, 0, 0], place[:, :1] + 1.0], dim=1)
+        torch.testing.assert_close(observed["a"].double()[worlds], wanted[worlds], rtol=0.0, atol=FLOAT32)
+
+    check(env.get_observations(), [0, 1, 2, 3])
+    env.step(torch.ones(4, 1))
+    check(env.reset(torch.tensor([True, False, True, False]))[0], [0, 2])
+    env.q[1, 0] = 1.0
+    observed, _, done, _ = env.step(torch.ones(4, 1))
+    assert done.tolist() == [0, 1, 0, 0]
+    check(observed, [1])
+
+
 def test_phases_are_counted_in_whole_steps():
     """Of a period of seven steps, far into an episode: exact to the rounding of a number below one."""
     clock = lambda w: w.phase(7 * w.dt)  # noqa: E731
@@ -205,12 +236,13 @@ def test_terms_of_one_memory_leave_it_to_each_other():
 def test_names_of_the_environments_own_memories_are_refused():
     """Every name of an environment's memory that its own parts keep; names that only resemble them stay free."""
     plain = cart_env(1, metrics={"m": lambda w: 0.0}, commands=commands.Uniform(((0.0, 1.0),)),
-                     observations={"a": [observations.Observation(lambda w: w.q, history=2)]},
+                     observations={"a": [observations.Observation(lambda w: w.q, bias=0.1, delay=(0, 1))]},
+                     rewards={"up": (curricula.Curriculum(1.0, 2.0, curricula.BySuccess("m", 0.5)), lambda w: 1.0)},
                      events=[events.Interval(lambda w: None)])  # fmt: skip
     for name in plain._layout.memory:
         with pytest.raises(ValueError, match="under which the environment itself remembers"):
             cart_env(1, rewards={"r": (1.0, lambda w, name=name: w.keep(name, [1.0]) or 0.0)})
-    free = ["last height", "actions", "command mine", "history", "sum", "until dawn"]
+    free = ["last height", "actions", "command mine", "history", "sum", "until dawn", "bias", "curriculum"]
 
     def own(w):
         for name in free:
@@ -511,12 +543,19 @@ def test_a_loaded_log_leaves_out_what_the_saved_one_does():
     (events.randomise("body_inertia", (-0.5, 1.0)), "of body trunk .* expected positive principal moments"),
     (events.randomise("body_inertia", (0.1, 0.2), "set"), "of body trunk .* expected positive principal moments"),
     (events.randomise("joint_damping", (-1.0, 0.5), "add"), "joint_damping of dof base:0 .* between -1 and 0.5"),
-    (events.randomise("actuator_delay", (0, 3), "set"), "of actuator 0 .* expected whole steps; use events.delays"),
+    (events.randomise("actuator_delay", (3, 3), "set"), "changes actuator_delay .* expected events.delays"),
+    (events.Values(("actuator_delay",), lambda w: None), "changes actuator_delay .* expected events.delays"),
+    (events.randomise("joint_armature", (-0.02, 0.02), "add", names="joint_1"),
+     "joint_armature of dof joint_1 .* between -0.01 and 0.03 .*zero or more"),
+    (events.Values(("joint_armature",), lambda w: w.values["joint_armature"].__setitem__(7, -1.0)),
+     r"draws joint_armature.7. as -1 .* expected zero or more"),
     (events.randomise("actuator_force_range", [(1.0, 2.0), (0.5, 1.5)], "set"), "expected lower ends below upper ends"),
     (events.randomise("joint_X_p", (-0.1, 0.1), "add"), "joint_X_p of joint base .* expected unit quaternions"),
     (events.Values(("body_mass",), lambda w: w.values["body_mass"].__setitem__(1, -1.0)),
      "an event draws body_mass.1. as -1 in world 0"),
-    (events.randomise("joint_limit_lower", (2e10, 3e10), "set", names="joint_1"),
+    (events.randomise("joint_limit_lower", (-1.0, 3e10), "set", names="joint_1"),
+     r"joint_limit_lower of dof joint_1 .* between -1 and 3e.10 .* expected lower limits below upper ones"),
+    (events.Values(("joint_limit_lower",), lambda w: w.values["joint_limit_lower"].__setitem__(6, 2e10)),
      "an event draws joint_limit_lower of dof joint_1 as .*, above joint_limit_upper 1e.10, in world 0"),
 ])  # fmt: skip
 def test_impossible_draws_are_refused_with_their_range(event, words):

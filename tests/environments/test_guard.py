@@ -10,8 +10,9 @@ import pytest
 import torch
 
 import warp_spo as spo
+from support.env_scenes import cart_env
 from warp_spo import env as environments
-from warp_spo.env import Bounds, Env, Observation, TorchTerm, actions, events, observations, robots
+from warp_spo.env import Bounds, Env, Observation, TorchTerm, actions, commands, events, observations, robots
 from warp_spo.env.bounds import size_of, speeds
 from warp_spo.env.training_log import TrainingLog, read_rows
 
@@ -162,6 +163,46 @@ def test_a_state_ends_its_world(guarded, value, name):
     assert env.q.isfinite().all() and env.qd.abs().max() < 100.0
 
 
+def test_memory_that_no_reset_clears_keeps_no_nan():
+    """Terms of all kinds return a sum and then add a root to it, of which one world's is once of a negative number."""
+
+    def late(name):
+        def term(w):
+            total = w.memory(name, 1, reset=None)[0]
+            w.keep(name, [total + np.sqrt(0.7 - w.q[0])])
+            return total
+
+        return term
+
+    class Late(actions.Effort):
+        def trace(self, w, action):
+            late("action's")(w)
+            return super().trace(w, action)
+
+    class Held(commands.Uniform):
+        def update(self, w, command):
+            late("command's")(w)
+            return command
+
+    env = cart_env(
+        WORLDS, actions=Late("slide"), commands=Held(((0.0, 1.0),)), rewards={"late": (1.0, late("reward"))},
+        observations={"actor": [late("observation")], "critic": [Observation(late("history"), history=2)]},
+        terminations={"late": lambda w: late("end")(w) > 1e6}, metrics={"late": late("metric")}, episode_length_s=10.0,
+    )  # fmt: skip
+    names = ["action's", "command's", "reward", "observation", "history", "end", "metric"]
+    sums = lambda: torch.cat([env.memory(name) for name in names], dim=1).clone()  # noqa: E731
+    step(env)
+    before = sums()
+    env.q[BAD, 0] = 0.8
+    step(env)
+    env.q[BAD, 0] = 0.0
+    after = sums()
+    assert torch.equal(after[BAD], before[BAD]) and (after[OTHERS] > before[OTHERS] + 0.5).all()
+    for _ in range(3):
+        assert step(env)[2] == [0] * WORLDS
+    assert (sums()[BAD] > after[BAD] + 1.5).all() and not counts(env)
+
+
 def test_actions_beyond_bounds():
     env = guarded_env(actions=actions.Control(scale=0.01), bounds=Bounds(action=1e3))
     for value, name in ((math.nan, "not finite"), (1e12, "beyond bounds"), (-1001.0, "beyond bounds")):
@@ -262,7 +303,7 @@ def test_bounds_are_explained(guarded):
 
 
 def test_a_training_prints_what_ended_worlds(tmp_path, capsys):
-    """What is new since the last line; rows hold sums of kinds, and of names those that have been counted."""
+    """Ends that are new since the last line; rows hold sums of kinds, and of names those that have been counted."""
     names = ("/not finite/reward", "/not finite/reward/up", "/not finite/reward/far", "/beyond bounds/action")
     counts = [torch.zeros(4), torch.tensor([3.0, 3.0, 0.0, 1.0]), torch.tensor([5.0, 3.0, 2.0, 1.0])]
     always = dict.fromkeys(("/episode/finished", "/episode/whole", "/episode/seconds"), torch.tensor(1.0))

@@ -110,3 +110,29 @@ def test_what_is_refused():
     ):
         with pytest.raises((ValueError, TypeError), match=words):
             make()
+
+
+@pytest.mark.parametrize(("kind", "relative"), [("position", True), ("pose", False)])
+def test_first_forces_are_those_of_the_action_zero(kind, relative):
+    """Where an episode starts they are of its own Jacobian and pose: those of a call of the stage of actions there."""
+    offset = 0.0 if relative else (0.5, 0.1, 0.4, 0.0, 1.0, 0.0, 0.0)
+    env = panda(
+        3, actions=DifferentialIK("hand", kind=kind, relative=relative, offset=offset, rest=0.2),
+        observations={"actor": [lambda w: w.joint_force]}, terminations={"far": lambda w: w.q[0] > 1.5},
+    )  # fmt: skip
+    none = torch.zeros(3, env.num_actions)
+
+    def check(observed, worlds):
+        state = env.state_dict()
+        wanted = env.dyn.actuator_force(env.q, env.qd, env.controls(none)["ctrl"])
+        env.load_state_dict(state)
+        assert wanted.abs().amax(dim=1).min() > 1.0
+        torch.testing.assert_close(observed["actor"][worlds], wanted[worlds], rtol=1e-5, atol=1e-4)
+
+    check(env.get_observations(), [0, 1, 2])
+    env.step(none + 0.3)
+    check(env.reset(torch.tensor([True, False, True]))[0], [0, 2])
+    env.q[1, 0] = 2.0
+    observed, _, done, _ = env.step(none + 0.3)
+    assert done.tolist() == [0, 1, 0]
+    check(observed, [1])

@@ -137,11 +137,17 @@ def test_actuators(device):
     assert both.actuator_error(3.0 * np.random.default_rng(1).normal(size=(3, model.nu))) <= EXACT
 
 
-def test_armature_and_damping_of_an_actuator(device):
-    """They belong to the joint, seen through the gear."""
-    more = '<actuator><motor joint="a" gear="3" armature=".2" damping=".5"/></actuator>'
-    both = assert_agrees(compiled(FREE.format(root="", world="", more=more)), device)
-    np.testing.assert_allclose(both.scene.values["joint_armature"][0, 6], 0.3 + 9 * 0.2)
+@pytest.mark.parametrize("more", ["", '<motor jointinparent="a" group="3" gear="-2" armature=".4" damping=".1"/>'])
+def test_armature_and_damping_of_actuators(more, device):
+    """They belong to the joint, each seen through its gear, those of several actuators and of a disabled one, too."""
+    more = f'<actuator><motor joint="a" gear="3" armature=".2" damping=".5"/>{more}</actuator>'
+    text = FREE.format(root="", world="", more=more)
+    model = compiled(text.replace('gravity="1 2 -9"', 'gravity="1 2 -9" actuatorgroupdisable="3"'))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*which the options disable")
+        both = assert_agrees(model, device)
+    added = 4 * 0.4 if model.nu > 1 else 0.0
+    np.testing.assert_allclose(both.scene.values["joint_armature"][0, 6], 0.3 + 9 * 0.2 + added)
 
 
 def test_an_even_actuatorfrcrange_is_the_effort_limit(device):

@@ -221,7 +221,7 @@ def test_softness_that_is_not_mujocos_default_is_said_to_be_left_out(floor, more
     message = str(said[0].message)
     for text in set(wanted.values()) - {""}:
         names = [f"sphere '{c.label}' of body 'b'" for c in scene.contacts if wanted[c.label] == text]
-        assert f"{text} of {', '.join(names)} (stiffness and damping are chosen" in message
+        assert f"{text} of {', '.join(names)} (contacts have none; stiffness and damping are chosen" in message
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # shapes that are not chosen, and defaults, say nothing
         spo.load(file, contacts="first", ground=spo.Plane())
@@ -231,4 +231,36 @@ def test_softness_that_is_not_mujocos_default_is_said_to_be_left_out(floor, more
         )
     )
     with pytest.warns(UserWarning, match="solref of sphere 'plain' of body 'b', sphere 'slow'"):
+        spo.load(file, contacts="ground")
+
+
+BELT = """<mujoco><worldbody><geom name="floor" type="plane" size="9 9 1" {floor}/>
+ <body pos="0 0 {height}"><freejoint/><geom name="ball" size=".1" mass="1" {ball}/></body>
+ <body pos="3 0 .1"><freejoint/><geom name="plain" size=".1" contype="0" conaffinity="2"/></body></worldbody>
+ <contact>{pair}</contact></mujoco>"""
+PAIR = '<pair geom1="floor" geom2="ball" {}/>'
+
+
+@pytest.mark.parametrize("part", ["floor", "ball", "pair"])
+@pytest.mark.parametrize(
+    ("name", "value", "height", "pull"),
+    [("surfacevel", "1 0 0", 0.099, 0.0), ("adhesion", "20", 0.0999, 15.0), ("gap", "-.01", 0.107, 0.0)],
+)
+def test_surfaces_that_move_stick_or_let_go_are_said_to_be_left_out(name, value, height, pull, part, tmp_path):
+    """With the attribute MuJoCo accelerates the ball otherwise; the warning names it, and no other ball."""
+    motions, file = [], tmp_path / "belt.xml"
+    for more in ("", f'{name}="{value}"'):
+        own = "floor" if (part, name) == ("pair", "surfacevel") else part
+        parts = {key: more if key == own else "" for key in ("floor", "ball")}
+        parts["ball"] += ' margin=".01"' if name == "gap" else ""
+        rest = 'margin=".01"' if name == "gap" else ""
+        pair = PAIR.format(f"{more if own == 'pair' else ''} {rest}") if part == "pair" else ""
+        file.write_text(BELT.format(height=height, pair=pair, **parts))
+        model = mujoco.MjModel.from_xml_path(str(file))
+        data = mujoco.MjData(model)
+        data.xfrc_applied[1, 2] = pull
+        mujoco.mj_forward(model, data)
+        motions.append(data.qacc.copy())
+    assert np.abs(motions[1] - motions[0]).max() > 0.1
+    with pytest.warns(UserWarning, match=rf"left out: {name} of sphere 'ball' of body 'body_0' \(contacts have none"):
         spo.load(file, contacts="ground")

@@ -205,6 +205,47 @@ def test_the_base_floats_or_stands(floating, kinds, tmp_path, device):
             spo.mujoco.Coordinates(scene, model)
 
 
+def test_keyframes_of_a_base_that_is_set_free(tmp_path):
+    """The base stands and moves as with the joints that it had: MuJoCo's poses and their differences."""
+    joints = '<joint type="slide" axis="1 2 0" ref=".1"/><joint axis="0 1 1" pos=".1 0 .2"/>'
+    base = f'<body pos="1 0 2" quat=".8 .1 .5 .3">{joints}<geom size=".1" pos=".2 .1 0"/>'
+    arm = '<body pos=".3 0 0"><joint name="arm" axis="1 0 0"/><geom size=".1"/></body></body>'
+    after = '<keyframe><key name="home" qpos=".4 .7 -.5" qvel="2 -3 .6"/></keyframe>'
+    file = written(tmp_path, world=base + arm, after=after)
+    scene = spo.load(file, floating=True)
+    assert [hinge.kind for hinge in scene.hinges] == ["free", "revolute"]
+    model = mujoco.MjModel.from_xml_path(str(file))
+    data, places, turns, step = mujoco.MjData(model), [], [], 1e-6
+    for half in (-0.5, 0.5):
+        data.qpos = model.key_qpos[0] + half * step * model.key_qvel[0]
+        mujoco.mj_kinematics(model, data)
+        places.append(data.xipos[1].copy())
+        turns.append(data.xquat[1].copy())
+    turn = np.zeros(3)
+    mujoco.mju_subQuat(turn, turns[1], turns[0])  # in the body's axes
+    mujoco.mju_rotVecQuat(turn, turn.copy(), turns[0])
+    data.qpos = model.key_qpos[0]
+    mujoco.mj_kinematics(model, data)
+    home = scene.keyframes["home"]
+    np.testing.assert_allclose(home.q[:3], data.xpos[1], atol=1e-14)
+    np.testing.assert_allclose(home.q[[6, 3, 4, 5]], data.xquat[1], atol=1e-14)
+    np.testing.assert_allclose(home.qd[:6], np.concatenate([places[1] - places[0], turn]) / step, atol=1e-8)
+    assert (home.q[7], home.qd[6]) == (-0.5, 0.6)
+
+
+def test_a_base_whose_mesh_is_missing_is_not_set_free_without_its_mass(tmp_path):
+    mesh, arm = '<geom type="mesh" mesh="m"/>', '<body><joint axis="0 1 0"/><geom size=".1" pos=".2 0 0"/></body>'
+    asset = '<asset><mesh name="m" file="no.stl"/></asset>'
+    file = written(tmp_path, before=asset, world=f"<body>{mesh}{arm}</body>")
+    with pytest.warns(UserWarning, match="left out: the meshes"):
+        assert spo.load(file).dof_count == 1
+    with pytest.raises(ValueError, match=r"load: .*robot.xml': MuJoCo refuses it: .*no.stl.* give.* an <inertial>"):
+        spo.load(file, floating=True)
+    file = written(tmp_path, before=asset, world=f"{mesh}<body>{INERTIA}{mesh}{arm}</body>")
+    with pytest.warns(UserWarning, match="left out: the meshes"):
+        assert spo.load(file, floating=True).values["body_mass"][0, 0] == 1.0
+
+
 def test_a_base_that_an_actuator_drives_stays(tmp_path):
     file = written(tmp_path, world=BASE, after='<actuator><motor name="m" joint="lift"/></actuator>')
     with pytest.raises(spo.UnsupportedError, match="actuator 'm', which needs joint 'lift', under floating="):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import warp_spo as spo
+from support.usd_texts import ARM_OF_MESHES
 from warp_spo.newton import shipped
 from warp_spo.reference.rotations import rotation
 from warp_spo.viewing.appearance import file_appearance
@@ -214,6 +215,39 @@ def test_meshes_of_packages_are_drawn_and_a_fixed_robot_stands_on_the_ground(tmp
         assert page.scene.ground.height == pytest.approx(-2.0)
         points = [point.position[2] for point in page.scene.contact_points]
         assert min(points) == pytest.approx(-2.0)
+    finally:
+        page.close()
+
+
+def test_meshes_of_a_usd_file_are_drawn_where_openusd_has_them(tmp_path):
+    """In centimetres with y up, below a turned and stretched frame; the page turns z up, and a slider the link."""
+    usd, geometry = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
+    file = tmp_path / "arm.usda"
+    file.write_text(ARM_OF_MESHES)
+    stage, places, wanted = usd.Stage.Open(str(file)), geometry.XformCache(), []
+    for path in ("/Arm/base/look/body", "/Arm/link/blade"):
+        prim = stage.GetPrimAtPath(path)
+        matrix = np.array(places.GetLocalToWorldTransform(prim))
+        x, y, z = 0.01 * (np.array(geometry.Mesh(prim).GetPointsAttr().Get()) @ matrix[:3, :3] + matrix[3, :3]).T
+        wanted.append(np.column_stack([x, -z, y]))
+    page = view(file, port=18080)
+    try:
+        assert not any("metersPerUnit" in note for note in page.notes)
+        look = file_appearance(file, page.scene)
+        for some, bodies in ((look.drawn, (0, 1)), (look.collision, (1,))):
+            assert tuple(surface.body for surface in some) == bodies
+            for surface in some:
+                pose = page.poses[surface.body]
+                found = surface.vertices @ rotation(pose[3:]).T + pose[:3]
+                np.testing.assert_allclose(sorted(found.tolist()), sorted(wanted[surface.body].tolist()), atol=1e-6)
+        red, green, blue = look.drawn[0].color
+        assert red > 0.9 > 0.5 > green > blue
+        (slider,) = page.sliders.by_label.values()
+        slider.value = 0.5
+        page.tick()
+        axis = rotation(page.poses[1][3:]) @ rotation(page._kinematics.body_poses(np.zeros((1, 1)))[0, 1, 3:]).T
+        about_y = [[np.cos(0.5), 0.0, np.sin(0.5)], [0.0, 1.0, 0.0], [-np.sin(0.5), 0.0, np.cos(0.5)]]
+        np.testing.assert_allclose(axis, np.transpose(about_y), atol=1e-6)  # the file's z is -y of the page
     finally:
         page.close()
 

@@ -12,8 +12,9 @@ import pytest
 import warp_spo as spo
 from benchmarks.robot_files import compare_urdf, short, urdf_files
 from warp_spo.newton import load
-from warp_spo.newton.files.inertia_repair import repaired
+from warp_spo.newton.files.inertia_repair import repair_body
 from warp_spo.reference.dense import Dense, homogeneous
+from warp_spo.viewing.appearance import file_appearance
 
 FILES = {file.name: file for file in urdf_files()}
 QUICK = ("go2.urdf", "tiago_pro.urdf", "talos_left_arm.urdf", "double_pendulum_continuous.urdf", "panda.urdf")
@@ -268,6 +269,60 @@ def test_what_urdf_does_not_define_is_named_once(tmp_path):
         load(written(tmp_path, robot(*pair("revolute", LIMIT))))
 
 
+def test_elements_of_a_robot_that_urdf_does_not_define_are_named(tmp_path):
+    """A loop of another program, and links in an element of their own, are no part of the scene."""
+    known = "<material/><gazebo/><transmission/><sensor/><ros2_control/><mujoco/>"
+    loop = '<loop_joint name="closing"><link1 link="a"/><link2 link="b"/></loop_joint>'
+    group = f"<group>{LINK.format('lost')}</group>"
+    words = "left out, because URDF does not define it: <loop_joint> 'closing', <group>; correct the names"
+    with pytest.warns(UserWarning, match=words):
+        scene = load(written(tmp_path, robot(*pair("revolute", LIMIT), known, loop, group)))
+    assert scene.body_labels == ["r/a", "r/b"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load(written(tmp_path, robot(*pair("revolute", LIMIT), known)))
+
+
+WEIGHED = {
+    '<box size="-1 1 1"/>': r"line 1, <box>: size is \[-1.0, 1.0, 1.0\]; expected none below zero",
+    "<box/>": "line 1, <box>: no attribute 'size'; expected one; write it",
+    '<sphere radius="-1"/>': "line 1, <sphere>: radius is -1; expected 0 or more",
+    '<cylinder radius="1"/>': "line 1, <cylinder>: no attribute 'length'",
+    '<ellipsoid radius="1"/>': "line 1, <ellipsoid>: a shape that is not read; expected .*<box>.* write <inertial>",
+    "": "line 1, <geometry>: it holds nothing; expected one shape; write a <collision> for each",
+    '<sphere radius="1"/><box size="1 1 1"/>': "it holds <sphere>, <box>; expected one shape",
+}
+
+
+@pytest.mark.parametrize("shape", WEIGHED)
+def test_shapes_that_cannot_be_weighed_are_refused(shape, tmp_path):
+    """A link without a mass had that of a shape of another size, or zero, and a warning that its shapes weigh it."""
+    link = f'<link name="b"><collision><geometry>{shape}</geometry></collision></link>'
+    file = written(
+        tmp_path, f'<robot name="r">{LINK.format("a")}{link}{JOINT.format("j", "revolute", "a", "b", LIMIT)}</robot>'
+    )
+    with pytest.raises(ValueError, match=f"load: .*robot.urdf', .*{WEIGHED[shape]}"):
+        load(file)
+    assert not load(file, repair=False).values["body_mass"][0, 1]
+
+
+@pytest.mark.parametrize(
+    ("shape", "volume"),
+    [
+        ('<box size=".1 .2 .3"/>', 0.006),
+        ('<sphere radius=".1"/>', 4e-3 * np.pi / 3),
+        ('<cylinder radius=".1" length=".3"/>', 3e-3 * np.pi),
+        ('<capsule radius=".1" length=".3"/>', 3e-3 * np.pi + 4e-3 * np.pi / 3),
+        ('<capsule radius=".1" height=".3"/>', 3e-3 * np.pi + 4e-3 * np.pi / 3),
+    ],
+)
+def test_shapes_weigh_as_much_as_their_volume(shape, volume, tmp_path):
+    link = f'<link name="b"><collision><geometry>{shape}</geometry></collision></link>'
+    file = written(tmp_path, robot(LINK.format("a"), link, JOINT.format("j", "revolute", "a", "b", LIMIT)))
+    with pytest.warns(UserWarning, match="links 'b' move and have no mass"):
+        assert load(file).values["body_mass"][0, 1] == pytest.approx(1000 * volume, rel=1e-6)
+
+
 def test_a_mimic_of_no_joint_is_left_out_with_a_warning(tmp_path):
     path = written(tmp_path, robot(*pair("revolute", '<mimic joint="x"/>')))
     with pytest.warns(UserWarning, match="line 4: joint 'j' mimics 'x', which is no joint of the file"):
@@ -355,7 +410,7 @@ def test_inertias_are_replaced_by_newtons_rule(rng):
         body = builder.add_body()
         builder.body_mass[body], builder.body_inertia[body] = float(mass), inertia
     model = builder.finalize(device="cpu")
-    ours = [repaired(float(mass), inertia) for mass, inertia in zip(masses, inertias, strict=True)]
+    ours = [repair_body(float(mass), inertia) for mass, inertia in zip(masses, inertias, strict=True)]
     np.testing.assert_array_equal(model.body_mass.numpy(), [mass for mass, _ in ours])
     assert sum(not np.array_equal(new, old) for (_, new), old in zip(ours, inertias, strict=True)) > 100
     for (_, mine), theirs, given in zip(ours, model.body_inertia.numpy(), moments, strict=True):
@@ -397,16 +452,16 @@ def test_small_bodies_are_repaired_in_proportion():
     """Impossible inertias are replaced at every size, by the same share of the largest moment."""
     for moments in ([-1.0, 2.0, 2.0], [1.0, 1.0, 4.0], [0.0, 1.0, 1.0]):
         for scale in (1e-4, 1e-8, 1e-12):
-            _, inertia = repaired(scale, scale * np.diag(moments))
-            _, same = repaired(1.0, 1e-4 * np.diag(moments))
+            _, inertia = repair_body(scale, scale * np.diag(moments))
+            _, same = repair_body(1.0, 1e-4 * np.diag(moments))
             np.testing.assert_allclose(inertia / scale, same / 1e-4, rtol=1e-9)
             low, middle, high = np.linalg.eigvalsh(inertia)
             assert low > 0.0 and low + middle >= high
 
 
 COLLADA = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
-<asset>{unit}<up_axis>Z_UP</up_axis></asset><library_geometries><geometry id="g"><mesh><source id="p">
-<float_array id="a" count="12">0 0 0 1000 0 0 0 2000 0 0 0 3000</float_array><technique_common>
+<asset>{unit}<up_axis>{axis}</up_axis></asset><library_geometries><geometry id="g"><mesh><source id="p">
+<float_array id="a" count="12">{points}</float_array><technique_common>
 <accessor source="#a" count="4" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
 <param name="Z" type="float"/></accessor></technique_common></source><vertices id="v">
 <input semantic="POSITION" source="#p"/></vertices><triangles count="4">
@@ -414,13 +469,14 @@ COLLADA = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11
 </geometry></library_geometries><library_visual_scenes><visual_scene id="s">
 <node><instance_geometry url="#g"/></node></visual_scene></library_visual_scenes><scene>
 <instance_visual_scene url="#s"/></scene></COLLADA>"""
+CORNERS = "0 0 0 1000 0 0 0 2000 0 0 0 3000"
 
 
 @pytest.mark.parametrize(("unit", "length"), [('<unit meter="0.001"/>', 1e-3), ("<unit/>", 1.0), ("", 1.0)])
 def test_a_mesh_has_the_unit_of_its_file(unit, length, tmp_path):
     """Millimetres in a COLLADA file are no metres: in contacts, and in masses from shapes."""
     pytest.importorskip("collada")
-    (tmp_path / "mesh.dae").write_text(COLLADA.format(unit=unit))
+    (tmp_path / "mesh.dae").write_text(COLLADA.format(unit=unit, axis="Z_UP", points=CORNERS))
     file = tmp_path / "robot.urdf"
     shape = '<collision><geometry><mesh filename="mesh.dae" scale="1 2 -1"/></geometry></collision>'
     file.write_text(f'<robot name="r"><link name="a">{shape}</link></robot>')
@@ -433,10 +489,47 @@ def test_a_mesh_has_the_unit_of_its_file(unit, length, tmp_path):
 
 def test_a_unit_that_is_none_is_named(tmp_path):
     pytest.importorskip("collada")
-    (tmp_path / "mesh.dae").write_text(COLLADA.format(unit='<unit meter="inch"/>'))
+    (tmp_path / "mesh.dae").write_text(COLLADA.format(unit='<unit meter="inch"/>', axis="Z_UP", points=CORNERS))
     file = tmp_path / "robot.urdf"
     shape = '<collision><geometry><mesh filename="mesh.dae"/></geometry></collision>'
     mass = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
     file.write_text(f'<robot name="r"><link name="a">{mass}{shape}</link></robot>')
     with pytest.raises(ValueError, match=r"line 1, <mesh>: its file 'mesh.dae' .* has no unit of length"):
         spo.load(file, floating=True, contacts="ground")
+
+
+@pytest.mark.parametrize("lie", ["y up", "z up"])
+def test_the_up_axis_of_meshes_counts_where_the_joints_bear_it_out(lie, tmp_path):
+    """Files say Y_UP. Links hang down to the next joint: so do meshes that lie with y up, as iCub's, and meshes that do
+    not, as those of MeshLab. What is drawn and what touches are the same."""
+    pytest.importorskip("collada")
+    wanted = np.array([[-0.02, -0.03, -0.3], [0.02, -0.03, -0.3], [0.0, 0.04, -0.3], [0.005, 0.01, 0.02]])
+    x, y, z = wanted.T
+    points = wanted if lie == "z up" else np.column_stack([x, z, -y])
+    text = " ".join(map(repr, points.ravel().tolist()))
+    (tmp_path / "link.dae").write_text(COLLADA.format(unit="", axis="Y_UP", points=text))
+    mesh = '<geometry><mesh filename="link.dae"/></geometry>'
+    mass = '<inertial><origin xyz="0 0 -0.15"/><mass value="1"/>{}</inertial>'.format(
+        '<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>'
+    )
+    turned = '<visual><origin xyz="0 0 0" rpy="0 0 1.5"/>' + mesh + "</visual>"
+    links = "".join(f'<link name="l{i}">{mass}<collision>{mesh}</collision>{turned}</link>' for i in range(4))
+    joints = "".join(
+        f'<joint name="j{i}" type="continuous"><parent link="l{i}"/><child link="l{i + 1}"/>'
+        '<origin xyz="0 0 -0.3"/><axis xyz="1 0 0"/></joint>'
+        for i in range(3)
+    )
+    file = tmp_path / "robot.urdf"
+    file.write_text(f'<robot name="r">{links}{joints}</robot>')
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scene = spo.load(file, floating=True, contacts="ground")
+    assert len(scene.contacts) == 4
+    for contact in scene.contacts:
+        np.testing.assert_allclose(sorted(contact.positions.tolist()), sorted(wanted.tolist()), atol=1e-9)
+    said = [str(each.message) for each in caught if "z is up" in str(each.message)]
+    assert len(said) == (lie == "y up") and all("8 COLLADA meshes are turned" in text for text in said)
+    about_z = np.array([[np.cos(1.5), -np.sin(1.5), 0.0], [np.sin(1.5), np.cos(1.5), 0.0], [0.0, 0.0, 1.0]])
+    for surface in file_appearance(file, scene).drawn:
+        found = np.unique(surface.vertices.round(5), axis=0)
+        np.testing.assert_allclose(sorted(found.tolist()), sorted((wanted @ about_z.T).round(5).tolist()), atol=2e-5)

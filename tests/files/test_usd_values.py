@@ -381,3 +381,80 @@ def test_what_a_loop_does_not_have_is_named(tmp_path):
     scene, warning = loaded(tmp_path, stage(*parts, closing))
     assert len(scene.loops) == 1
     assert "drive:angular:physics:stiffness (/World/k); physics:lowerLimit (/World/k)" in warning
+
+
+# -- values that are blocked, poses and shapes that no scene has -------------------------------------------------------
+BLOCKED = {
+    "float physics:lowerLimit": "float physics:upperLimit = 400",
+    "float physics:upperLimit": "float physics:lowerLimit = -400",
+    "point3f physics:localPos0": "",
+    "point3f physics:localPos1": "point3f physics:localPos0 = (1, 2, 3)",
+    "quatf physics:localRot0": "point3f physics:localPos0 = (1, 2, 3)",
+    "quatf physics:localRot1": "float physics:lowerLimit = -400",
+    "bool physics:jointEnabled": "",
+    "bool physics:excludeFromArticulation": "",
+    "uniform token physics:axis": "float physics:upperLimit = 400",
+    "float drive:angular:physics:damping": "float drive:angular:physics:stiffness = 3",
+    "float drive:angular:physics:maxForce": "float drive:angular:physics:stiffness = 3",
+}
+
+
+@pytest.mark.parametrize("kind", ["Revolute", "Fixed"])
+@pytest.mark.parametrize("name", BLOCKED)
+def test_a_blocked_value_of_a_joint_is_the_schemas(name, kind, tmp_path):
+    """As if the file did not write it; limits of an importer began at 90 degrees."""
+    apis = ("PhysicsDriveAPI:angular",)
+    without, _ = loaded(tmp_path, swing(BLOCKED[name], kind, apis))
+    blocked, _ = loaded(tmp_path, swing(f"{BLOCKED[name]}\n{name} = None", kind, apis))
+    for value in without.values:
+        np.testing.assert_array_equal(blocked.values[value], without.values[value], err_msg=value)
+    (one,), (other,) = blocked.hinges, without.hinges
+    assert (one.kind, str(one.axis), one.parent_pose.tolist()) == (
+        other.kind,
+        str(other.axis),
+        other.parent_pose.tolist(),
+    )
+
+
+def test_a_blocked_gravity_is_that_of_the_earth(tmp_path):
+    for name, was, gravity in (
+        ("float physics:gravityMagnitude", " = 10", [0, 0, -9.81]),
+        ("vector3f physics:gravityDirection", " = (0, 0, -1)", [0, 0, -10]),
+    ):
+        scene, _ = loaded(tmp_path, swing(head=HEAD.replace(name + was, name + " = None")))
+        np.testing.assert_allclose(scene.values["gravity"][0], gravity, rtol=SINGLE)
+
+
+def test_values_of_a_spline_are_named(tmp_path):
+    """They are values at times alone, too, also of places."""
+    spline = ".spline = {\n1: 5; post held,\n10: 7; post held,\n}\n"
+    turned = f'double xformOp:rotateZ{spline}uniform token[] xformOpOrder = ["xformOp:rotateZ"]'
+    text = swing(f"float physics:upperLimit{spline}").replace("float physics:mass = 2.0", f"float physics:mass{spline}")
+    text = text.replace("double3 xformOp:translate = (0, 0, 0)", "")
+    text = text.replace('uniform token[] xformOpOrder = ["xformOp:translate"]', turned)
+    file = tmp_path / "robot.usda"
+    file.write_text(text)
+    with pytest.warns(UserWarning) as found:  # also of a mass that is replaced
+        scene = spo.load(file)
+    warning = " ".join(str(one.message) for one in found)
+    for name, path in (("physics:mass", "arm"), ("physics:upperLimit", "j"), ("xformOp:rotateZ", "arm")):
+        assert f"{name} (/World/{path})" in warning
+    assert only(scene, "joint_limit_upper") == 1e10
+
+
+def test_an_up_axis_that_usd_does_not_have_is_refused(tmp_path):
+    """The importer turned gravity alone."""
+    with pytest.raises(ValueError, match=r"robot.usda': upAxis is 'X'; expected Y or Z"):
+        loaded(tmp_path, swing(head=HEAD.replace('upAxis = "Z"', 'upAxis = "X"')))
+
+
+@pytest.mark.parametrize("hinge", ["", "Revolute", "Fixed"])
+def test_a_kinematic_body_is_fixed_or_refused(hinge, tmp_path):
+    text = stage(body("arm", "bool physics:kinematicEnabled = 1"), joint("j", None, "arm", kind=hinge) if hinge else "")
+    if hinge == "Fixed":
+        assert loaded(tmp_path, text)[0].dof_count == 0
+        return
+    with pytest.raises(
+        spo.UnsupportedError, match=r"kinematic bodies that no fixed joint holds .'/World/arm'.*kinematicE"
+    ):
+        loaded(tmp_path, text)

@@ -86,10 +86,10 @@ int main()
     for (int lane = 0; lane < 32; ++lane)
         threads.emplace_back([&, lane] {
             threadIdx.x = lane;
-            for (int tile = 0; tile < 2 * JOINTS; ++tile) {
-                float sums[2];
-                network::tile(staged.data() + tile / 2 * (STAGED / JOINTS) + 16 * (tile % 2), weights.data(), sums);
-                if (lane % 4 < 2) found[16 * tile + lane / 4 + 8 * (lane % 4)] = sums[lane % 4];
+            for (int joint = 0; joint < JOINTS; ++joint) {
+                float sums[4];
+                network::tiles(staged.data() + joint * (STAGED / JOINTS), weights.data(), sums);
+                found[32 * joint + lane / 4 + 8 * (lane % 4)] = sums[lane % 4];
             }
         });
     for (auto& each : threads) each.join();

@@ -283,6 +283,8 @@ WARNED = [
     *_warned("flag", "equality 'weld', which is not active", equality=word("disable"), constraint=word("disable")),
     *_warned("mocap", "the motion of mocap body 'mocap'", mocap=word("true")),
     *_warned("floor", "geom", solref=SOFTNESS["solref"], solimp=SOFTNESS["solimp"]),
+    *_warned("floor", "surfacevel.* of|all contacts, which", surfacevel=vector()),
+    *_warned("floor", "adhesion.* of|all contacts, which", adhesion=number(1, 5)),
 ]
 for key in ("connect", "connect sites", "weld", "coupling", "tie"):
     name = key.replace(" ", "_")

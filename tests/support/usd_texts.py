@@ -71,3 +71,71 @@ def loaded(folder, text, **options):
     messages = [str(one.message) for one in found if one.category is UserWarning]
     assert len(messages) < 2, messages
     return scene, "".join(messages)
+
+
+ARM_OF_MESHES = """#usda 1.0
+(
+    defaultPrim = "Arm"
+    metersPerUnit = 0.01
+    kilogramsPerUnit = 1.0
+    upAxis = "Y"
+)
+def PhysicsScene "Physics" { 
+    float physics:gravityMagnitude = 981
+    vector3f physics:gravityDirection = (0, -1, 0)
+}
+def Xform "Arm" ( prepend apiSchemas = ["PhysicsArticulationRootAPI"] )
+{
+    def Xform "base" ( prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI"] )
+    {
+        double3 xformOp:translate = (0, 20, 0)
+        uniform token[] xformOpOrder = ["xformOp:translate"]
+        float physics:mass = 2
+        float3 physics:diagonalInertia = (200, 200, 200)
+        def Xform "look"
+        {
+            double3 xformOp:scale = (2, 1, 1)
+            double3 xformOp:rotateXYZ = (0, 30, 0)
+            double3 xformOp:translate = (0, -3, 0)
+            uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateXYZ", "xformOp:scale"]
+            def Mesh "body"
+            {
+                int[] faceVertexCounts = [4, 3, 3, 3, 3]
+                int[] faceVertexIndices = [0, 1, 2, 3, 0, 4, 1, 1, 4, 2, 2, 4, 3, 3, 4, 0]
+                point3f[] points = [(-5, 0, -5), (5, 0, -5), (5, 0, 5), (-5, 0, 5), (0, 12, 0)]
+                color3f[] primvars:displayColor = [(0.9, 0.2, 0.1)]
+            }
+        }
+    }
+    def Xform "link" ( prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI"] )
+    {
+        double3 xformOp:translate = (0, 30, 0)
+        uniform token[] xformOpOrder = ["xformOp:translate"]
+        float physics:mass = 1
+        float3 physics:diagonalInertia = (50, 50, 50)
+        def Mesh "blade" ( prepend apiSchemas = ["PhysicsCollisionAPI", "PhysicsMeshCollisionAPI"] )
+        {
+            uniform token physics:approximation = "convexHull"
+            int[] faceVertexCounts = [3, 3, 3, 3]
+            int[] faceVertexIndices = [0, 2, 1, 0, 1, 3, 1, 2, 3, 2, 0, 3]
+            point3f[] points = [(-2, 0, -2), (2, 0, -2), (0, 0, 3), (1, 40, 0)]
+            color3f[] primvars:displayColor = [(0.1, 0.4, 0.9)]
+        }
+    }
+    def PhysicsFixedJoint "root" { 
+        rel physics:body1 = </Arm/base>
+        point3f physics:localPos0 = (0, 20, 0)
+    }
+    def PhysicsRevoluteJoint "hinge"
+    {
+        uniform token physics:axis = "Z"
+        rel physics:body0 = </Arm/base>
+        rel physics:body1 = </Arm/link>
+        point3f physics:localPos0 = (0, 10, 0)
+        point3f physics:localPos1 = (0, 0, 0)
+        float physics:lowerLimit = -90
+        float physics:upperLimit = 90
+    }
+}
+"""
+"""A fixed arm in centimetres whose y is up: a turned and stretched mesh that is drawn, and one that collides, too."""

@@ -251,6 +251,7 @@ class Dynamics:
         self.granularity = self.plan.granularity
         self.recursions = Sweeps(scene, self.plan, self.device, self.dtype, self.variable)
         self.programs = Programs(self.recursions, self.plan)
+        self._checks_results = True  # whether the status of a step is also that of what it has written, one launch more
         self._coordinate_kinds: wp.array = wp.array(kinds_of_coordinates(scene), dtype=wp.int32, device=self.device)
         self.values, self._handle = TensorValues(), register(self)
         self._replays = Replays(self.device, self.recursions.call_order)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..errors import UnsupportedError, is_bool, shown
+from ..errors import UnsupportedError, is_bool, quoted, shown
 from ..scene.scene import Scene
 from .bounds import Bounds
 from .compile.guard import BEYOND, NOT_FINITE
@@ -138,11 +138,7 @@ def check_actions(call: str, actions: Any, worlds: int, labels: list[str]) -> to
             f"{call}: actions has {kind}shape {tuple(tensor.shape)}; expected ({worlds}, {len(labels)}) "
             f"[world, action]: {', '.join(map(shown, labels))}"
         )
-    if tensor.requires_grad and torch.is_grad_enabled():
-        raise ValueError(
-            f"{call}: actions requires grad; expected a tensor without, because a step of an environment has no "
-            "gradient; call it inside torch.no_grad(), or pass actions.detach(); Dynamics.step has gradients"
-        )
+    refuse_gradient(call, "actions", tensor)
     return tensor
 
 
@@ -151,6 +147,55 @@ def refuse_without_numbers(call: str, name: str, tensor: torch.Tensor) -> None:
     kind = "on the device meta, without numbers" if tensor.is_meta else f"of layout {tensor.layout}"
     if tensor.is_meta or tensor.layout != torch.strided:
         raise ValueError(f"{call}: {name} is {kind}; expected a dense tensor or an array")
+
+
+def refuse_gradient(call: str, name: str, tensor: torch.Tensor) -> None:
+    """Raise ValueError for a tensor that requires grad where torch records: a step would lose the gradient."""
+    if tensor.requires_grad and torch.is_grad_enabled():
+        raise ValueError(
+            f"{call}: {name} requires grad; expected a tensor without, because a step of an environment has no "
+            f"gradient; use torch.no_grad(), or {name}.detach(); Dynamics.step has gradients"
+        )
+
+
+def refuse_written_gradients(env: Any) -> None:
+    """Raise ValueError if a caller has written a tensor that requires grad into one of the environment's.
+
+    Their numbers stay, and the environment goes on without a gradient.
+    """
+    held = {"env.q": env.q, "env.qd": env.qd, "env.actions": env.actions, "env.memory(...)": env._tensors["memory"]}
+    held |= {f"env.values[{name!r}]": tensor for name, tensor in env.values.items()}
+    names = [name for name, tensor in held.items() if tensor.requires_grad]
+    for name in names:
+        held[name].detach_()
+    if names and torch.is_grad_enabled():
+        raise ValueError(
+            f"Env: x requires grad, which was written into {', '.join(names)}; expected x.detach(), because a step of "
+            "an environment has no gradient; Dynamics.step has gradients"
+        )
+
+
+def check_written(target: str, x: Any, held: torch.Tensor) -> torch.Tensor:
+    """Return numbers x that may be written into ``held``, whose name for callers is ``target``, as a tensor.
+
+    Raises:
+        TypeError: they are no numbers.
+        ValueError: they have another shape, are complex, sparse or on the device meta, or require grad.
+    """
+    call, expected = f"{target} = x", f"expected real numbers {tuple(held.shape)}"
+    try:
+        tensor = torch.as_tensor(x)
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"{call}: x is {quoted(x)}; {expected}") from None
+    refuse_without_numbers(call, "x", tensor)
+    refuse_gradient(call, "x", tensor)
+    try:
+        shape = torch.broadcast_shapes(tensor.shape, held.shape)
+    except RuntimeError:
+        shape = None
+    if shape != held.shape or tensor.is_complex():
+        raise ValueError(f"{call}: x is {tensor.dtype} {tuple(tensor.shape)}; {expected}")
+    return tensor.to(held)
 
 
 def check_mask(call: str, mask: Any, worlds: int, device: torch.device) -> torch.Tensor:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import shown
 from ..scene.scene import Scene
 from .compile.vectors import find
 from .observations import Observation, name_of
@@ -80,6 +81,11 @@ class Bounds:
         terms = [name_of(term) for each in groups.values() for term in each]
         of_terms = _spread("observation", "term", self.observation, terms, np.full(len(terms), 1e5))
         causes = [cause for group, terms in groups.items() for cause in term_causes(group, terms)]
+        for cause in causes:
+            if causes.count(cause) > 1:
+                raise ValueError(
+                    f"Env: two terms are counted as {shown(cause)}; expected other names of groups, or of TorchTerm"
+                )
         return limits | dict(zip(causes, of_terms, strict=True))
 
 

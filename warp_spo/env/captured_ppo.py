@@ -22,7 +22,7 @@ from torch import nn
 
 from . import fused_update
 from .compile.cuda_graphs import Captured
-from .fused_update import FusedUpdate
+from .fused_update import FusedUpdate, average
 from .not_finite import NotFiniteError, find_term
 from .startup import plain_step
 
@@ -34,13 +34,13 @@ class CapturedPPO(PPO):
     """rsl_rl's PPO. On CUDA a rollout is one graph and an update another; on a CPU the same code is called.
 
     An update reads the device once. The learning rate lives on the device, where an adaptive one follows the KL
-    divergence. Actor and critic run on two streams, or on a CPU in two threads. With several processes an update has
-    two graphs for a minibatch, between which gradients are averaged. What cannot be captured learns as in rsl_rl, and a
+    divergence. Actor and critic run on two streams, or on a CPU in two threads. Several processes average gradients,
+    KL divergences and normalisers inside of the update's graph. What cannot be captured learns as in rsl_rl, and a
     warning says why.
 
     Attributes:
         obstacle: why it learns as in rsl_rl; "" where it does not. deviation: mean deviation of actions.
-        log: what ``env.log()`` said after the rollout.
+        log: what ``env.log()`` said after the rollout. meanwhile: called before an update waits for the device.
     """
 
     learning_rate: float
@@ -61,7 +61,6 @@ class CapturedPPO(PPO):
         self._sums, self._found = (torch.zeros(n, dtype=torch.float64, device=self.device) for n in (3, 6))
         size = self.storage.num_envs * self.storage.num_transitions_per_env // self.num_mini_batches
         self._order = torch.zeros(self.num_mini_batches, size, dtype=torch.int64, device=self.device)
-        self._index = self._order[0].clone()
         self._side = torch.cuda.Stream(self.device) if self._on_gpu else None
         threads = not self._on_gpu and not self.is_multi_gpu and (os.cpu_count() or 1) > 1
         self._helper = ThreadPoolExecutor(1, "critic") if threads else None
@@ -75,6 +74,7 @@ class CapturedPPO(PPO):
         self._kept: tuple[torch.Tensor, ...] = ()  # what was learned before this update
         self._kept_rate = 0.0
         self.deviation = torch.zeros(())
+        self.meanwhile: Callable[[], None] = lambda: None
         self.log, self._log_values = dict[str, float](), torch.zeros(0, device=self.device)
         self._adopt()
 
@@ -190,13 +190,12 @@ class CapturedPPO(PPO):
             self.deviation = self.actor.output_std.detach().mean().cpu()
         else:
             self._order.copy_(torch.randperm(self._order.numel(), device=self.device).view_as(self._order))
-            if self.is_multi_gpu:
-                self._learn_together()
-            else:
-                self._learning()
+            self._learning()
             self.storage.clear()
             size = len(self._found)
-            numbers = torch.cat([self._found, self._log_values]).tolist()  # the one wait for the device
+            held = torch.cat([self._found, self._log_values])
+            self.meanwhile()
+            numbers = held.tolist()  # the one wait for the device
             *means, rate, deviation, finite = numbers[:size]
             self.log = dict(zip(self._log_names, numbers[size:], strict=True))
             self.learning_rate, self.deviation = rate, torch.tensor(deviation)
@@ -208,40 +207,22 @@ class CapturedPPO(PPO):
 
     def _learn(self) -> None:
         """Learn from the rollout in all epochs, in the order of ``_order``."""
-        self._begin()
+        self._keep()
+        self._sums.zero_()
         batches = [self._batch(index) for index in self._order]  # the same in all epochs, as in rsl_rl
         if self._fused is not None:
             self._fused.learn(batches)
         for _ in range(0 if self._fused is not None else self.num_learning_epochs):
             for batch in batches:
                 self._differentiate(batch)
+                if self.is_multi_gpu:
+                    self.reduce_parameters()
+                    average(self._kl)
                 self._descend()
         for model in (self.actor, self.critic):
             if model.obs_normalization:
                 renormalize(model, self.storage.observations)
         self._summarize()
-
-    def _learn_together(self) -> None:
-        """Learn as ``_learn``, with gradients, KL divergences and normalisers averaged over all processes."""
-        self._begin()
-        for _ in range(self.num_learning_epochs):
-            for index in self._order:
-                self._index.copy_(index)
-                self._differentiating()
-                self.reduce_parameters()
-                torch.distributed.all_reduce(self._kl)
-                self._kl /= self.gpu_world_size
-                self._descending()
-        for model in (self.actor, self.critic):
-            if model.obs_normalization:
-                place = model.obs_normalizer._std
-                model.update_normalization(self.storage.observations.flatten(0, 1))
-                model.obs_normalizer._std = place.copy_(model.obs_normalizer._std)
-        self._summarize()
-
-    def _begin(self) -> None:
-        self._keep()
-        self._sums.zero_()
 
     def _batch(self, index: torch.Tensor) -> RolloutStorage.Batch:
         """Return some samples of the rollout."""
@@ -357,9 +338,13 @@ class CapturedPPO(PPO):
         self._step = plain_step(self.optimizer)
         self._fused = FusedUpdate(self) if self._can_fuse else None
         self._learning = self._captured(self._learn, "the update")
-        batch = lambda: self._differentiate(self._batch(self._index))  # noqa: E731
-        self._differentiating = self._captured(batch, "the gradient")
-        self._descending = self._captured(self._descend, "the optimizer")
+
+    def broadcast_parameters(self) -> None:
+        """Take over networks and normalisers of the first process, as in rsl_rl."""
+        if self._fused is None:
+            return super().broadcast_parameters()
+        for tensor in (self._fused.weights, *self._normalizer_buffers()):  # parameters need not be contiguous
+            torch.distributed.broadcast(tensor, src=0)
 
     def save(self) -> dict:
         """Return what a checkpoint holds, as rsl_rl writes and reads it."""
@@ -381,11 +366,13 @@ class CapturedPPO(PPO):
     def _learned_tensors(self) -> list[torch.Tensor]:
         """Return the tensors that learning changes: networks, normalisers, the optimizer's state."""
         if self._fused is not None:
-            models = (self._raw_actor, self._raw_critic)
-            return [*self._fused.learned_tensors(), *(x for model in models for x in model.obs_normalizer.buffers())]
+            return [*self._fused.learned_tensors(), *self._normalizer_buffers()]
         networks = [*self._raw_actor.state_dict().values(), *self._raw_critic.state_dict().values()]
         state = [value for each in self.optimizer.state.values() for value in each.values()]
         return networks + [value for value in state if isinstance(value, torch.Tensor)]
+
+    def _normalizer_buffers(self) -> list[torch.Tensor]:
+        return [x for model in (self._raw_actor, self._raw_critic) for x in model.obs_normalizer.buffers()]
 
     @torch.no_grad()
     def _keep(self) -> None:
@@ -400,12 +387,12 @@ class CapturedPPO(PPO):
         """Undo an update: copy back networks, normalisers and optimizer from :meth:`_keep`, and the learning rate."""
         tensors = self._learned_tensors()
         torch._foreach_copy_(tensors[: len(self._kept)], self._kept)
+        for tensor in tensors[len(self._kept) :]:  # Adam's, whose first step this was; a graph may hold their places
+            tensor.zero_()
         self.learning_rate = self._kept_rate
         self._rate.fill_(self.learning_rate)
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate if self.obstacle else self._rate
-        if len(self._kept) < len(tensors):  # the optimizer had taken no step
-            self.optimizer.state.clear()
 
     def _is_finite(self) -> torch.Tensor:
         """Return whether networks and normalisers hold finite numbers alone, the same in all processes."""
@@ -437,8 +424,18 @@ def renormalize(model: MLPModel, observations: Any) -> None:
         return
     x = torch.cat([observations[name] for name in model.obs_groups], dim=-1).flatten(0, 1)
     mean, variance = x.mean(dim=0, keepdim=True), x.var(dim=0, unbiased=False, keepdim=True)
-    held.count += len(x)
-    rate, delta = len(x) / held.count, mean - held._mean
+    count: Any = len(x)
+    if torch.distributed.is_initialized():  # the mean of all first, then variances around it
+        own, count = mean, torch.full_like(held.count, len(x))
+        torch.distributed.all_reduce(count)
+        mean = own * len(x)
+        torch.distributed.all_reduce(mean)
+        mean /= count
+        variance = len(x) * (variance + (own - mean).square())
+        torch.distributed.all_reduce(variance)
+        variance /= count
+    held.count += count
+    rate, delta = count / held.count, mean - held._mean
     held._mean += rate * delta
     held._var += rate * (variance - held._var + delta * (mean - held._mean))
     held._std.copy_(held._var.sqrt())

@@ -42,6 +42,7 @@ def levels(self: Env) -> dict[str, torch.Tensor]:
     return {name: self.memory(name) for name in self._levels}
 
 
+@torch.no_grad()
 def start_at(self: Env, levels: Mapping[str, torch.Tensor]) -> None:
     """Start all worlds anew at levels that :meth:`levels` returned, of this environment or of one like it.
 
@@ -76,6 +77,7 @@ def state_dict(self: Env) -> dict[str, torch.Tensor]:
     return {name: tensor.clone() for name, tensor in _tensors(self).items()} | {STEPS: torch.tensor(self._steps)}
 
 
+@torch.no_grad()
 def load_state_dict(self: Env, state: Mapping[str, torch.Tensor]) -> None:
     """Continue from what :meth:`state_dict` returned, of an environment that was made with the same arguments.
 

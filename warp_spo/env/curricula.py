@@ -159,8 +159,7 @@ def remembered_mean(call: str, w: World, term: str) -> tuple[Any, Condition]:
         kind = "a metric and a reward are named" if metric else "no metric or reward is named"
         raise ValueError(f"{call}: {kind} {term!r}; expected the name of one of them: {known}")
     if metric:
-        total, count = w.memory(f"sum metric {term}", 1)[0], w.memory(f"steps of metric {term}", 1)[0]
-        return total / where(count > 0.5, count, 1.0), count > 0.5
+        return metric_mean(w, term)
     weight = w.weights[term]
     if isinstance(weight, Curriculum) or weight == 0.0:
         raise ValueError(
@@ -170,6 +169,12 @@ def remembered_mean(call: str, w: World, term: str) -> tuple[Any, Condition]:
     taken = w.steps_taken
     seconds = where(taken > 0.5, taken, 1.0) * w.dt
     return w.memory(f"sum reward {term}", 1)[0] / (weight * seconds), taken > 0.5
+
+
+def metric_mean(w: World, metric: str) -> tuple[Any, Condition]:
+    """Return the mean of a metric over the steps of the episode in which it was finite, and whether there is one."""
+    total, count = w.memory(f"sum metric {metric}", 1)[0], w.memory(f"steps of metric {metric}", 1)[0]
+    return total / where(count > 0.5, count, 1.0), count > 0.5
 
 
 def _digits(x: float) -> str:

@@ -27,12 +27,14 @@ def as_rows(name: str, values: np.ndarray) -> np.ndarray:
     return values.reshape(1 if name in WHOLE else len(values), -1)
 
 
-def check_draws(scene: Scene, name: str, entries: Sequence[int], spans: Sequence[Range], how: str) -> None:
+def check_draws(
+    scene: Scene, name: str, entries: Sequence[int], spans: Sequence[Range], how: str, changed: Sequence[str]
+) -> None:
     """Raise ValueError if ``events.randomise`` may draw what a value cannot be.
 
     Args:
         name: of the value. entries: that it draws. spans: one for all numbers of an entry, or one each.
-        how: "scale", "add" or "set".
+        how: "scale", "add" or "set". changed: names of the values that any event changes.
     """
     if name == HEIGHTS:
         raise ValueError(
@@ -47,6 +49,9 @@ def check_draws(scene: Scene, name: str, entries: Sequence[int], spans: Sequence
     for entry in entries:
         found = np.array([drawn(rows[entry], corner) for corner in np.unique(corners, axis=0)])
         expected = _complaint(scene, name, rows[entry], found)
+        if name in LIMITS and not {*LIMITS} <= {*changed}:
+            lower, upper = (found if each == name else scene.values[each][0][entry] for each in LIMITS)
+            expected = "lower limits below upper ones" if (np.float32(lower) > np.float32(upper)).any() else ""
         if expected:
             low, high = (f"{end:g}" for end in (found.min(), found.max()))
             asked = ", ".join(map(str, spans))
@@ -71,11 +76,12 @@ def check_drawn(scene: Scene, values: Mapping[str, Any]) -> None:
     for name, found in every.items():
         own = scene.values[name][0]
         wrong = ~np.isfinite(found) if name not in RANGES else np.isnan(found)
-        wrong |= (found < 0.0) & (name in NOT_NEGATIVE)
+        negative = (found < 0.0) & _never_negative(name, own)
+        wrong |= negative
         wrong |= (found <= 0.0) & (own > 0.0) & (name == "body_mass")
         if wrong.any():
             world, *place = (int(i[0]) for i in np.nonzero(wrong))
-            more = "above zero" if name == "body_mass" else "zero or more" if name in NOT_NEGATIVE else "finite numbers"
+            more = "above zero" if name == "body_mass" else "zero or more" if negative.any() else "finite numbers"
             span = f"between {found.min():g} and {found.max():g}"
             raise ValueError(
                 f"Env: an event draws {name}{place} as {found[wrong][0]:g} in world {world}, and all its numbers are "
@@ -87,9 +93,7 @@ def _complaint(scene: Scene, name: str, own: np.ndarray, found: np.ndarray) -> s
     """Return what was expected of an entry, ``own`` in the scene and one of ``found`` in a world; "" for nothing."""
     if name == "body_mass" and (found <= 0.0).any() and (own > 0.0 or (found < 0.0).any()):
         return "masses above zero"
-    if name == "actuator_delay" and (np.ptp(found) > 0.0 or not (found == np.round(found)).all()):
-        return "whole steps; use events.delays"
-    if name in NOT_NEGATIVE and (found < 0.0).any():
+    if (found[:, _never_negative(name, own)] < 0.0).any():
         return "zero or more"
     if name == "body_inertia":
         return "" if _are_inertias(own, found) else "positive principal moments; events.pseudo_inertia keeps them so"
@@ -98,6 +102,11 @@ def _complaint(scene: Scene, name: str, own: np.ndarray, found: np.ndarray) -> s
     if name in POSES and not np.allclose(np.linalg.norm(found[:, QUATERNION], axis=1), 1.0, atol=1e-6):
         return "unit quaternions; give seven spans, of which the last four leave the quaternion alone"
     return ""
+
+
+def _never_negative(name: str, own: np.ndarray) -> np.ndarray:
+    """Return which numbers of a value, ``own`` in the scene, no world may have below zero."""
+    return (name in NOT_NEGATIVE) | ((name == "joint_armature") & (own >= 0.0))
 
 
 def _are_inertias(own: np.ndarray, found: np.ndarray) -> bool:

@@ -92,7 +92,7 @@ class Env(VecEnv):
         replay: runs a step without its inputs and results; ``replay.captured`` says of how many graphs it is made.
         values: what events have made of the scene's values, torch tensors [world, ...] by name. Numbers that
             torch writes there count for terms and for the dynamics from the next step on, until an event draws the
-            value anew.
+            value anew. They have no gradient; a tensor that requires grad is refused.
         dyn: the :class:`Dynamics`. has_commands: whether it gives commands.
         action_labels, action_clips: of each action, what it sets, and None or the (lowest, highest) that counts.
         options: with which a task has changed its arguments, see ``settings.make_env``; {} without a task.
@@ -158,6 +158,7 @@ class Env(VecEnv):
         check_pair_solver("Env", pair_solver)
         options: dict[str, Any] = {"granularity": granularity, "pair_solver": pair_solver}
         self.dyn = Dynamics(scene, worlds, self.warp_device, "float32", variable, **options)
+        self.dyn._checks_results = False  # the guard looks at them
         store = self._store = self._allocate(tracing)
         self.q, self.qd, self.actions, self.chosen = (store.tensors[n] for n in ("q", "qd", "actions", "chosen"))
         self._tensors, self._controls, self._report = store.tensors, store.controls, StepReport(**store.written)
@@ -228,7 +229,12 @@ class Env(VecEnv):
     set_seed = seeding.set_seed
 
     def take_written_values(self) -> None:
-        """Copy to the dynamics what has been written into ``values``; steps do so, but for a graph of many."""
+        """Copy to the dynamics what has been written into ``values``; steps do so, but for a graph of many.
+
+        Raises:
+            ValueError: the tensor that was written there, or into another of the environment's, requires grad.
+        """
+        arguments.refuse_written_gradients(self)
         if self.values.were_written():
             self._set_values()
 
@@ -281,7 +287,7 @@ class Env(VecEnv):
 
     @command.setter
     def command(self, value: Any) -> None:
-        self.command[:] = value
+        self.command[:] = arguments.check_written("env.command", value, self.command)
 
     @property
     def command_ranges(self) -> dict[str, tuple[float, float]]:
@@ -296,7 +302,7 @@ class Env(VecEnv):
 
     # -- stepping --------------------------------------------------------------------------------------------------
     def get_observations(self) -> Any:
-        """Return the observations of the present state, a TensorDict of [world, number] by group."""
+        """Return the observations of the last step or reset, a TensorDict of [world, number] by group."""
         return self._observations(self._store.out.clone())
 
     def reset(self, mask: torch.Tensor | None = None, seed: int | Sequence[int] | None = None) -> tuple[Any, dict]:

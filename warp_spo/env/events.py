@@ -281,7 +281,7 @@ def randomise(
         if len(spans) not in (1, rows.shape[1]):
             raise ValueError(f"events.randomise: {name} has {rows.shape[1]} numbers an entry; span has {len(spans)}")
         entries = entries_of(w.scene, name, names)
-        check_draws(w.scene, name, entries, spans, how)
+        check_draws(w.scene, name, entries, spans, how, w._layout.values)
         draws: list[Any] = []
         for i, entry in enumerate(entries):
             if i == 0 or not alike:
@@ -428,8 +428,13 @@ def entries_of(scene: Any, name: str, names: Any) -> list[int]:
 
 def changed_values(scene: Any, events: Sequence[Any]) -> tuple[str, ...]:
     """Return the names of the values that events change; ValueError if one is none of a scene's."""
-    names = dict.fromkeys(name for event in events if isinstance(event, Values) for name in event.names)
+    events = [event for event in events if isinstance(event, Values)]
+    names = dict.fromkeys(name for event in events for name in event.names)
     for name in names:
+        if name == "actuator_delay" and not all(isinstance(event, Delays) for event in events if name in event.names):
+            raise ValueError(
+                "Env: an event changes actuator_delay and does not say how long delays may be; expected events.delays"
+            )
         if name not in scene.values:
             raise ValueError(f"Env: an event changes {name!r}; expected one of {', '.join(scene.values)}")
         if not scene.values[name][0].size:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from ..errors import shown
+from ..execution.status_words import words_of_states
 from ..scene.scene import Scene
 from ..status import Status
 from .failures import ACTIONS, FORCE, FORMAT, JUDGED, STATUS, USER, plan_of, scene_of_rows, state_arrays
@@ -342,11 +343,12 @@ class _Replay:
             rest["done"].append(bool(env._store.part(out, "done").view(torch.int32)[0, 0]))
             rest["status"].append(int(env._status[0]))  # type: ignore[index]
             rest["force"].append(None if self.force is None else self.force[0].clone())
+        status = words_of_states(env.scene, self.arrays["q"].cpu().numpy(), np.array(rest["status"]))
         grown = (env._tensors["faults"][:, 0] > before).nonzero().ravel().tolist()
-        cause = env._layout.guard.names[grown[0]] if grown else f"status {Status(rest['status'][-1]).name}"
+        cause = env._layout.guard.names[grown[0]] if grown else f"status {Status(status[-1]).name}"
         force = None if self.force is None else torch.stack(rest["force"]).cpu().numpy()
         return ReplayedFailure(
-            torch.stack(q).cpu().numpy(), torch.stack(qd).cpu().numpy(), force, np.array(rest["status"]),
+            torch.stack(q).cpu().numpy(), torch.stack(qd).cpu().numpy(), force, status,
             torch.stack(rest["reward"]).cpu().numpy(), np.array(rest["done"]), cause, differences, self.failure,
         )  # fmt: skip
 

@@ -1,9 +1,9 @@
-"""What is kept of worlds that fail: a ring of their last states on the device, and a thread that writes files.
+"""Records of worlds that fail: a ring of their last states on the device, and a thread that writes files.
 
 A world fails where the guard ends it, or where a step of the dynamics gives it a status from CONTACT on by severity.
-The device copies the ring of such a world aside within the step; the host learns of it by a number that is copied to
-pinned memory at the end of each step and read after the next one. So a step in which nothing fails waits for nobody,
-and it does not matter how far the host is ahead.
+The device copies the ring of such a world aside within the step; the host learns of it by a number that the device
+writes to pinned memory then. So a step in which nothing fails takes two launches, of which one runs beside others, and
+waits for nobody; it does not matter how far the host is ahead.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from ..execution.status_words import words_of_states
 from ..kernels import failure_ring as kernels
 from ..runtime import launches
 from ..scene.scene import Scene
@@ -142,23 +143,22 @@ class FailureRing:
 
         places, pitches = zip(*(each.places() for each in self._arrays.values()), strict=True)
         kinds = len(self._guard) + len(Status)
-        counted = [int(each.severity >= Status.CONTACT.severity) for each in sorted(Status)]
+        self._counted = sum(1 << each for each in Status if each.severity >= Status.CONTACT.severity)
         self._ring = zeros(SLOTS, self._words)
         self._rows = zeros(FILES, SLOTS, sum(each.words for each in self._arrays.values()))
-        self._chosen, self._count = zeros(FILES, 4), zeros(2)
+        self._chosen = zeros(FILES, 4)
         self._clock, self._until = zeros(1), zeros(worlds)
         own = dict(
-            counts=torch.tensor(counted, dtype=torch.int32, device=self._device), taken=zeros(kinds), found=zeros(1),
-            first=zeros(kinds), status=self.status, until=self._until, latest=zeros(worlds), clock=self._clock,
-            files=self._count, chosen=self._chosen, rows=self._rows, fault=self._fault,
+            taken=zeros(kinds), first=zeros(kinds), status=self.status, until=self._until, latest=zeros(worlds),
+            clock=self._clock, files=zeros(1), chosen=self._chosen, rows=self._rows, fault=self._fault,
         )  # fmt: skip
         self._own = own
         self._wp = {name: wp.from_torch(tensor) for name, tensor in own.items()}
         self._wp["place"] = wp.array(np.concatenate(places), dtype=wp.int64, device=self._wp_device)
         self._wp["pitch"] = wp.array(np.concatenate(pitches), dtype=wp.int32, device=self._wp_device)
         pinned = self._device.type == "cuda"
-        self._seen = torch.zeros(2, dtype=torch.int32, pin_memory=True) if pinned else self._count
-        self._seen_files = self._seen.numpy()
+        self._told = torch.zeros(1, dtype=torch.int32, pin_memory=pinned)
+        self._told_files = self._told.numpy()
         self._host = [torch.empty_like(x[0], device="cpu", pin_memory=pinned) for x in (self._rows, self._chosen)]
         self.bytes = sum(x.nbytes for x in (self._ring, self._rows, self._until, self.status))
         self._chunks = [
@@ -201,32 +201,28 @@ class FailureRing:
 
     def find(self) -> None:
         """Find worlds that have failed in this step, and copy their rings aside."""
-        own, worlds = self._wp, len(self.status)
-        marked = [own[name] for name in ("taken", "until", "latest", "clock", "first", "found")]
-        given = [own["fault"], own["status"], own["counts"], len(self._guard), FILES_OF_A_CAUSE]
-        self._launch(kernels.mark_worlds(), worlds, given, marked)
-        names = ("first", "found", "status", "taken", "until", "latest", "clock", "files", "chosen")
-        self._launch(kernels.choose_worlds(), 1, [SLOTS], [own[name] for name in names])
-        inputs = [SLOTS, self._words, self._ring.data_ptr(), *(own[n] for n in ("place", "pitch", "files", "chosen"))]
-        self._launch(kernels.copy_rings(), tuple(self._rows.shape[1:]), inputs, [own["rows"]])
-        if self._seen is not self._count:
-            self._seen.copy_(self._count, non_blocking=True)
+        own, threads = self._wp, kernels.THREADS if self._device.type == "cuda" else 1
+        ring = [SLOTS, self._words, self._ring.data_ptr(), own["place"], own["pitch"]]
+        failed = [own["fault"], own["status"], len(self._guard), self._counted, FILES_OF_A_CAUSE]
+        written = [own[name] for name in ("taken", "until", "latest", "first", "clock", "files", "chosen", "rows")]
+        written.append(self._told.data_ptr())
+        self._launch(kernels.find_failures(), threads, [threads, *ring, *failed], written, threads)
 
-    def _launch(self, kernel: wp.Kernel, dim: Any, inputs: list, outputs: list) -> None:
+    def _launch(self, kernel: wp.Kernel, dim: Any, inputs: list, outputs: list, block_dim: int = 256) -> None:
         with self._stream():
-            launches.launch(kernel, dim, inputs, outputs, device=self._wp_device)
+            launches.launch(kernel, dim, inputs, outputs, device=self._wp_device, block_dim=block_dim)
 
     def clear(self) -> None:
         """Forget all that was found."""
-        for name in ("taken", "found", "until", "clock", "files"):
+        for name in ("taken", "until", "clock", "files"):
             self._own[name].zero_()
         self._own["first"].fill_(kernels.NOBODY)
-        self._seen.zero_()
+        self._told.zero_()
 
     # -- on the host -----------------------------------------------------------------------------------------------
     def look(self) -> None:
         """Let the thread write the failures that the device has told of; warn once of a file that was not written."""
-        count = int(self._seen_files[1])
+        count = int(self._told_files[0])
         while self._handed < count:
             if self._pool is None:
                 self._pool = ThreadPoolExecutor(1, "warp_spo failures")
@@ -285,8 +281,9 @@ class FailureRing:
         for name, each in self._arrays.items():
             arrays[name] = each.of_rows(rows[:held, at : at + each.words])
             at += each.words
-        later = torch.tensor([status], dtype=torch.int32)
-        arrays[STATUS] = torch.cat([arrays[STATUS][1:], later])  # a slot holds that of the step before
+        words = np.append(arrays[STATUS][1:].numpy(), status)  # a slot holds that of the step before
+        arrays[STATUS] = torch.from_numpy(words_of_states(self._scene[0], arrays["q"].numpy(), words))
+        status = int(arrays[STATUS][-1])
         name = self._guard[cause] if cause < len(self._guard) else f"status {Status(status).name}"
         scene = self._pickled_scene(world)
         return self._facts | {

@@ -17,7 +17,8 @@ from ..runtime.launches import launch
 from ..runtime.torch_tensors import stream
 
 ALIGNED = 64  # weights from one array to the next: products read and write whole lines of memory
-WIDE = 8  # entries that products read at once: rows of inputs and of the first weights are filled up with zeros
+WIDE = 16  # what products take at once: layers, their inputs and their results are filled up with zeros to multiples
+FEW = 64  # threads of a block where there are few
 
 _compiling: list[threading.Thread] = []  # what start_compiling has begun
 
@@ -36,55 +37,63 @@ class FusedBatch(NamedTuple):
     returns: torch.Tensor
 
 
+class FusedParameter(NamedTuple):
+    """A parameter filled up with zeros to multiples of WIDE, its gradient, and what products read of it."""
+
+    values: torch.Tensor
+    gradient: torch.Tensor
+    factor: torch.Tensor
+
+
 class FusedNetwork:
     """Layers of ELU and a last one without, whose results and gradients have their places.
 
     Args:
-        layers: linear ones. weights, gradients: of all parameters, as products read and write them. rows: samples of a
-            minibatch. dtype: of products.
+        layers: weights and biases, from the first. rows: samples of a minibatch.
     """
 
-    def __init__(self, layers: Sequence[nn.Linear], weights: Any, gradients: Any, rows: int, dtype: torch.dtype):
-        device = layers[0].weight.device
+    def __init__(self, layers: Sequence[tuple[FusedParameter, FusedParameter]], rows: int):
+        device, dtype = layers[0][0].factor.device, layers[0][0].factor.dtype
         self.device = str(wp.device_from_torch(device))
-        self.layers = list(layers)
-        self.weights = [weights[layer.weight] for layer in layers]
-        self.gradients = [gradients[layer.weight] for layer in layers]
-        self.bias_gradients = [gradients[layer.bias] for layer in layers]
+        self.weights, self.biases = zip(*layers, strict=True)
+        widths = [len(bias.values) for bias in self.biases]
         self.results, self.slopes = (
-            [torch.empty(rows, layer.out_features, dtype=dtype, device=device) for layer in layers] for _ in range(2)
+            [torch.zeros(rows, width, dtype=dtype, device=device) for width in widths] for _ in range(2)
         )
         parts = -(-rows // kernels.CHUNK)
-        self.sums = [torch.empty(parts, layer.out_features, device=device) for layer in layers[:-1]]
+        self.sums = [torch.empty(parts, width, device=device) for width in widths[:-1]]
         self.ones = torch.ones(parts, device=device)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the last layer's results without its bias [sample, number]."""
-        for layer, weight, result in zip(self.layers, self.weights, self.results, strict=True):
-            torch.mm(x, weight.t(), out=result)
-            if layer is not self.layers[-1]:
-                threads = -(-len(x) // 4), layer.out_features
-                start(kernels.add_bias_and_elu, threads, [result, layer.bias.detach()], self.device)
+        """Return the last layer's results without its bias [sample, number and more]."""
+        for weight, bias, result in zip(self.weights, self.biases, self.results, strict=True):
+            torch.mm(x, weight.factor.t(), out=result)
+            if result is not self.results[-1]:
+                threads = -(-len(x) // 4), result.shape[1] // 2
+                start(kernels.add_bias_and_elu, threads, [pairs(result), vectors(bias.values)], self.device)
             x = result
         return x
 
     def backward(self, x: torch.Tensor) -> None:
         """Compute the gradients of weights from that of the last results, ``slopes[-1]``."""
-        for i in reversed(range(len(self.layers))):
+        for i in reversed(range(len(self.weights))):
             slope = self.slopes[i]
-            multiply(slope.t(), self.results[i - 1] if i else x, self.gradients[i])
+            multiply(slope.t(), self.results[i - 1] if i else x, self.weights[i].gradient)
             if i:
                 below, sums = self.slopes[i - 1], self.sums[i - 1]
-                torch.mm(slope, self.weights[i], out=below)
-                start(kernels.differentiate_elu, sums.shape, [self.results[i - 1], below, sums], self.device)
-                torch.mv(sums.t(), self.ones, out=self.bias_gradients[i - 1])
+                torch.mm(slope, self.weights[i].factor, out=below)
+                threads = len(sums), sums.shape[1] // 2
+                numbers = [pairs(self.results[i - 1]), pairs(below), vectors(sums)]
+                start(kernels.differentiate_elu, threads, numbers, self.device)
+                torch.mv(sums.t(), self.ones, out=self.biases[i - 1].gradient)
 
 
 class FusedUpdate:
     """An update of actor and critic that are layers of ELU, with a Gaussian policy and Adam.
 
     Weights, gradients and Adam's averages of both networks lie in four arrays, of which parameters and the optimizer's
-    state are views. Actor and critic run on two streams up to Adam's step, which is one kernel.
+    state are views. Actor and critic run on two streams up to Adam's step, which is one kernel. Several processes
+    average gradients, and the sums of losses behind them, by one call for a minibatch.
 
     Args:
         alg: whose networks learn; :func:`find_obstacle` says whether they can.
@@ -99,23 +108,22 @@ class FusedUpdate:
         self.dtype = torch.bfloat16 if alg.use_mixed_precision else torch.float32
         models = alg._raw_actor, alg._raw_critic
         parameters = [weight for model in models for weight in model.parameters()]
-        shapes = [tuple(weight.shape) for weight in parameters]
-        for i, weight in enumerate(parameters):
-            if any(weight is model.mlp[0].weight for model in models):
-                shapes[i] = len(weight), round_up(weight.shape[1], WIDE)
+        shapes = [tuple(round_up(size, WIDE) for size in weight.shape) for weight in parameters]
         sizes = [round_up(math.prod(shape), ALIGNED) for shape in shapes]
         self.border, end = sum(sizes[: len([*models[0].parameters()])]), sum(sizes)
-        flat = [torch.zeros(end, device=device) for _ in range(4)]
+        actions = len(alg._raw_actor.distribution.std_param)
+        self.averaged = torch.zeros(end + 2 * actions + 2, device=device)
+        flat = [self.averaged[:end] if i == 1 else torch.zeros(end, device=device) for i in range(4)]
         self.weights, self.gradients, self.first, self.second = flat
         self.rate = alg._rate.view(1)
         self.copies = torch.zeros(end if self.dtype != torch.float32 else 0, dtype=self.dtype, device=device)
         self.steps = torch.zeros((), device=device)
         self.gradient_of: dict[Any, torch.Tensor] = {}
-        factors, slopes = dict[Any, torch.Tensor](), dict[Any, torch.Tensor]()
+        held: dict[Any, FusedParameter] = {}
         begin = 0
         for weight, shape, size in zip(parameters, shapes, sizes, strict=True):
             parts = [each[begin : begin + math.prod(shape)].view(shape) for each in (*flat, self.copies) if len(each)]
-            own = [part[:, : weight.shape[1]] if weight.ndim == 2 else part for part in parts]
+            own = [part[tuple(map(slice, weight.shape))] for part in parts]
             state = alg.optimizer.state.get(weight)
             own[0].copy_(weight.detach())
             if state:
@@ -124,23 +132,20 @@ class FusedUpdate:
                 self.steps.copy_(state["step"])
             alg.optimizer.state[weight] = {"step": self.steps, "exp_avg": own[2], "exp_avg_sq": own[3]}
             weight.data = own[0]
-            factors[weight], slopes[weight], self.gradient_of[weight] = (
-                parts[4 if len(parts) > 4 else 0],
-                parts[1],
-                own[1],
-            )
+            held[weight] = FusedParameter(parts[0], parts[1], parts[4 if len(parts) > 4 else 0])
+            self.gradient_of[weight] = own[1]
             begin += size
         self.group = alg.optimizer.param_groups[0]
         self.deviations = alg._raw_actor.distribution.std_param.detach()
         self.deviation_gradient = self.gradient_of[alg._raw_actor.distribution.std_param]
         rows = alg._order.shape[1]
         self.actor, self.critic = (
-            FusedNetwork([x for x in model.mlp if isinstance(x, nn.Linear)], factors, slopes, rows, self.dtype)
-            for model in (alg._raw_actor, alg._raw_critic)
+            FusedNetwork([(held[x.weight], held[x.bias]) for x in model.mlp if isinstance(x, nn.Linear)], rows)
+            for model in models
         )
-        actions, count = len(self.deviations), alg.num_learning_epochs * alg.num_mini_batches
-        self.terms = torch.empty(rows, 2 * actions + 2, device=device)
-        self.value_terms = torch.empty(rows, 2, device=device)
+        count = alg.num_learning_epochs * alg.num_mini_batches
+        self.terms = torch.empty(2 * actions + 2, rows, device=device)
+        self.value_terms = torch.empty(2, rows, device=device)
         self.sums = torch.zeros(count, 2 * actions + 2, device=device)
         self.value_sums, self.entropies = torch.zeros(count, 2, device=device), torch.zeros(count, device=device)
         self.norms, self.corrections = torch.zeros(2, device=device), torch.zeros(2, device=device)
@@ -192,6 +197,12 @@ class FusedUpdate:
                 self._differentiate_critic(batch, k)
             self._differentiate_actor(batch, k)
             alg._join()
+            if alg.is_multi_gpu:
+                totals = self.averaged[len(self.gradients) :].copy_(self.sums[k])
+                average(self.averaged)
+                self._adapt(totals, k)
+                for network in range(2):
+                    self._take_norm(network)
             beta1, beta2 = self.group["betas"]
             numbers = [self.weights, self.gradients, self.first, self.second, self.copies, self.border, self.norms,
                        alg.max_grad_norm, beta1, beta2, self.group["eps"], self.rate, self.corrections]  # fmt: skip
@@ -202,31 +213,45 @@ class FusedUpdate:
 
     def _differentiate_critic(self, batch: FusedBatch, k: int) -> None:
         alg, net = self.alg, self.critic
-        last = net.layers[-1].bias.detach()
+        last = net.biases[-1].values
         values = net.forward(batch.critic)
         numbers = [values, last, batch.values, batch.returns, alg.clip_param, alg.use_clipped_value_loss,
                    alg.value_loss_coef, net.slopes[-1], self.value_terms]  # fmt: skip
-        start(kernels.value_loss, len(values), numbers, self.device)
-        torch.sum(self.value_terms, dim=0, out=self.value_sums[k])
-        net.bias_gradients[-1].copy_(self.value_sums[k, :1])
+        start(kernels.value_loss, len(values), numbers, self.device, FEW)
+        torch.sum(self.value_terms, dim=1, out=self.value_sums[k])
+        net.biases[-1].gradient[:1].copy_(self.value_sums[k, :1])
         net.backward(batch.critic)
-        torch.linalg.vector_norm(self.gradients[self.border :], out=self.norms[1])
+        if not alg.is_multi_gpu:
+            self._take_norm(1)
 
     def _differentiate_actor(self, batch: FusedBatch, k: int) -> None:
         alg, net = self.alg, self.actor
-        last = net.layers[-1].bias.detach()
+        last = net.biases[-1].values
         limits = alg._raw_actor.distribution.std_range
         means = net.forward(batch.actor)
         numbers = [means, last, self.deviations, *limits, batch.actions, batch.old_mean, batch.old_deviation,
                    batch.old_log_prob, batch.advantages, alg.clip_param, net.slopes[-1], self.terms]  # fmt: skip
-        start(kernels.surrogate_loss, len(means), numbers, self.device)
-        torch.sum(self.terms, dim=0, out=self.sums[k])
-        numbers = [self.sums[k], self.deviations, *limits, alg.entropy_coef, alg.desired_kl if alg._adapts else 0.0,
-                   *self.group["betas"], self.deviation_gradient, net.bias_gradients[-1], self.rate,
+        start(kernels.surrogate_loss, len(means), numbers, self.device, FEW)
+        torch.sum(self.terms, dim=1, out=self.sums[k])
+        if not alg.is_multi_gpu:
+            self._adapt(self.sums[k], k)
+        net.backward(batch.actor)
+        if not alg.is_multi_gpu:
+            self._take_norm(0)
+
+    def _adapt(self, sums: torch.Tensor, k: int) -> None:
+        """Finish the actor's gradients of deviations and of the last bias, and adapt the rate, by sums of losses."""
+        alg = self.alg
+        limits = alg._raw_actor.distribution.std_range
+        numbers = [sums, self.deviations, *limits, alg.entropy_coef, alg.desired_kl if alg._adapts else 0.0,
+                   *self.group["betas"], self.deviation_gradient, self.actor.biases[-1].gradient, self.rate,
                    self.steps.view(1), self.corrections, self.entropies[k : k + 1]]  # fmt: skip
         start(kernels.adapt, len(self.deviations), numbers, self.device)
-        net.backward(batch.actor)
-        torch.linalg.vector_norm(self.gradients[: self.border], out=self.norms[0])
+
+    def _take_norm(self, network: int) -> None:
+        """Take the norm of a network's gradients: 0: the actor, 1: the critic."""
+        own = self.gradients[self.border :] if network else self.gradients[: self.border]
+        torch.linalg.vector_norm(own, out=self.norms[network])
 
 
 def find_obstacle(alg: Any) -> str:
@@ -242,9 +267,7 @@ def find_obstacle(alg: Any) -> str:
     group = alg.optimizer.param_groups[0]
     if type(alg.optimizer) is not torch.optim.Adam or group["weight_decay"] or group["amsgrad"]:
         return "the optimizer is not Adam without decay"
-    if alg.is_multi_gpu or alg.normalize_advantage_per_mini_batch:
-        return "several processes learn" if alg.is_multi_gpu else "advantages are normalised for each minibatch"
-    return ""
+    return "advantages are normalised for each minibatch" if alg.normalize_advantage_per_mini_batch else ""
 
 
 def start_compiling(device: str) -> None:
@@ -261,13 +284,31 @@ def round_up(count: int, size: int) -> int:
     return -(-count // size) * size
 
 
-def start(kernel: Any, dim: Any, numbers: Sequence[Any], device: str) -> None:
-    """Launch a kernel on torch's current stream; tensors may be among its arguments."""
+def start(kernel: Any, dim: Any, numbers: Sequence[Any], device: str, block: int = 256) -> None:
+    """Launch a kernel on torch's current stream, in blocks of threads; tensors may be among its arguments."""
     arguments = [wp.from_torch(x, requires_grad=False) if isinstance(x, torch.Tensor) else x for x in numbers]
     held = wp.get_device(device)
     scope = wp.ScopedStream(stream(held), sync_enter=False) if held.is_cuda else wp.ScopedDevice(held)
     with scope:
-        launch(kernel, dim if isinstance(dim, int) else tuple(dim), arguments, [], device=held)
+        launch(kernel, dim if isinstance(dim, int) else tuple(dim), arguments, [], device=held, block_dim=block)
+
+
+def pairs(x: torch.Tensor) -> Any:
+    """Return the words of two numbers of a matrix, float32 or bfloat16."""
+    if x.dtype == torch.float32:
+        return wp.from_torch(x.view(torch.int64), dtype=wp.uint64, requires_grad=False)
+    return wp.from_torch(x.view(torch.int32), dtype=wp.uint32, requires_grad=False)
+
+
+def vectors(x: torch.Tensor) -> Any:
+    """Return vectors of two numbers of an array."""
+    return wp.from_torch(x.view(*x.shape[:-1], -1, 2), dtype=wp.vec2f, requires_grad=False)
+
+
+def average(numbers: torch.Tensor) -> None:
+    """Make numbers their means over all processes."""
+    torch.distributed.all_reduce(numbers)
+    numbers /= torch.distributed.get_world_size()
 
 
 def multiply(a: torch.Tensor, b: torch.Tensor, out: torch.Tensor) -> None:

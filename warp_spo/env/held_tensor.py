@@ -6,6 +6,8 @@ from typing import Any
 
 import torch
 
+from .arguments import refuse_gradient
+
 PLACES = {
     "masked_fill_": ("masked_fill_", ("mask",)), "masked_scatter_": ("masked_fill_", ("mask",)),
     "index_fill_": ("index_fill_", ("dim", "index")), "index_copy_": ("index_fill_", ("dim", "index")),
@@ -43,6 +45,9 @@ class HeldTensor(torch.Tensor):
         """Call a function of torch; mark what it writes."""
         kwargs = {} if kwargs is None else kwargs
         name, first = getattr(func, "__name__", ""), args[0] if args else None
+        if isinstance(first, cls) and _writes(name):
+            for x in (each for each in (*args[1:], *kwargs.values()) if isinstance(each, torch.Tensor)):
+                refuse_gradient("env.command", "x", x)
         with torch._C.DisableTorchFunctionSubclass():
             found = func(*args, **kwargs)  # before marks: what torch refuses writes nothing
             if isinstance(first, cls):
@@ -69,8 +74,13 @@ def _mark(marks: torch.Tensor, name: str, args: tuple[Any, ...], kwargs: dict[st
         where = [args[i] if i < len(args) else kwargs[place] for i, place in enumerate(places)]
         one = torch.ones((), dtype=marks.dtype, device=marks.device) if name == "index_put_" else 1.0
         getattr(marks, function)(*where, one)
-    elif name.endswith("_") and not name.endswith("__"):
+    elif _writes(name):
         marks.fill_(1.0)
+
+
+def _writes(name: str) -> bool:
+    """Return whether a tensor's function of this name writes in place."""
+    return name == "__setitem__" or (name.endswith("_") and not name.endswith("__"))
 
 
 def _shares(tensor: torch.Tensor, other: Any) -> bool:

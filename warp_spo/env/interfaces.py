@@ -81,7 +81,7 @@ def make_vector(env: Env, tensors: bool = False, autoreset_mode: Any = "SameStep
                 self._waiting = self._waiting & ~mask
             if not isinstance(seed, list | tuple | np.ndarray):
                 super().reset(seed=None if seed is None else int(seed))
-            return _plain(env, self._shown(env.get_observations()), tensors), {}
+            return _plain(env, self._choose_observations(env.get_observations()), tensors), {}
 
         def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict]:
             """Take a step; "log" and, in the mode SAME_STEP, "final_obs" are in the information, [world]."""
@@ -110,9 +110,9 @@ def make_vector(env: Env, tensors: bool = False, autoreset_mode: Any = "SameStep
                 info |= _final(env, extras["final_observations"], ends, tensors)
             parts = (rewards, ends & ~late, late)
             plain = parts if tensors else tuple(part.cpu().numpy() for part in parts)
-            return _plain(env, self._shown(observed), tensors), *plain, info
+            return _plain(env, self._choose_observations(observed), tensors), *plain, info
 
-        def _shown(self, observed: Any) -> Any:
+        def _choose_observations(self, observed: Any) -> Any:
             """Return observations, the last ones of their episode in worlds that wait."""
             if self._last is None:
                 return observed

@@ -174,6 +174,7 @@ def make_runner(
         learner.steps * env.num_envs * runner.gpu_world_size, dataclasses.asdict(learner),
     )  # fmt: skip
     runner.logger = log  # type: ignore[assignment]
+    runner.alg.meanwhile = log.write_elsewhere  # type: ignore[attr-defined]
     return runner
 
 

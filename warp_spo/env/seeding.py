@@ -23,12 +23,12 @@ def set_seed(self: Env, seed: int | Sequence[int]) -> None:
     A world's numbers depend on its seed and on its own number alone. :meth:`reset` takes a seed, too, and draws anew
     what was drawn at the start.
     """
-    _write(self, *_checked("Env.set_seed", seed, self.num_envs))
+    _write(self, *_check_seeds("Env.set_seed", seed, self.num_envs))
 
 
 def begin(env: Env, seed: Any) -> None:
     """Make all that steps change what it is before the first reset of a new environment; draw what is drawn once."""
-    words = _checked("Env.reset", seed, env.num_envs)
+    words = _check_seeds("Env.reset", seed, env.num_envs)
     env._store.clear()
     for part in env._actuator_state or ():
         part.zero_()
@@ -50,7 +50,7 @@ def _write(env: Env, seed: int, ticks: np.ndarray) -> None:
         env._failures.restart(seed, env._steps)
 
 
-def _checked(call: str, seed: Any, worlds: int) -> tuple[int, np.ndarray]:
+def _check_seeds(call: str, seed: Any, worlds: int) -> tuple[int, np.ndarray]:
     """Return the seed of all worlds and the steps of random numbers that each has behind it, uint32 [world].
 
     One seed for all: no steps. One for each world: SEED_OF_SEEDS, and as many steps as a hash of the world's own seed

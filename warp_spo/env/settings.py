@@ -85,7 +85,7 @@ def write(folder: Path, run: Mapping[str, Any], learner: Any, given: Mapping[str
     """Write what a training runs with: the command, versions, all of the learner, and what is set of the task."""
     tree = {name: value for name, value in given.items() if name != "learner"}
     tree |= {"run": dict(run), "versions": versions(), "learner": dataclasses.asdict(learner)}
-    text = "# What this training ran with. play and --resume read it, and so does train --settings FILE.\n"
+    text = "# Settings of this training. play and --resume read it, and so does train --settings FILE.\n"
     write_bytes(folder / FILE, (text + text_of(tree)).encode())
 
 

@@ -91,10 +91,7 @@ class DifferentialIK:
         through, hinges = self.through, self.through.hinges(w.scene)
         self._check(w, hinges)
         q = vector(w.q[int(w.scene.q_start[hinge])] for hinge in hinges)
-        if w._stage.name != "act":  # where an episode starts its action is to stay
-            found = q
-        else:
-            found = q + self._joint_steps(w, hinges, q, action)
+        found = q + self._joint_steps(w, hinges, q, action)
         values = through.gears(w) * (found - w.encoder_bias(hinges))
         return list(zip(through.entries(w.scene), values, strict=True))
 

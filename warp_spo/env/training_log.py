@@ -48,6 +48,7 @@ class TrainingLog:
         self.lost: dict[str, str] = {}  # loggers that have failed, and why
         self._others, self.frames, self._config = list(others), frames, config or {}
         self._open: dict[str, Any] = {}  # loggers
+        self._later: tuple[dict[str, float], int, float] | None = None  # what they have not got yet
         self._size, self._waiting = 0, b""  # bytes of the file that are whole, and those that it still lacks
 
     def init_logging_writer(self) -> None:
@@ -98,7 +99,9 @@ class TrainingLog:
         row["reward"] = sum(value for name, value in row.items() if name.startswith("/reward/"))
         self.rows.append(row)
         self._append(to_json_lines([row]))
-        self._log_elsewhere(row, it)
+        self.write_elsewhere()
+        if self._open:
+            self._later = loggers.tags(row, self.env, self.frames), it, time.time()
         if it % self.every == 0 or it + 1 == total_it:
             reward = f"{row['reward']:8.3f}" if row["/episode/finished"] else f"{'-':>8}"
             length = f"{row['/episode/seconds']:5.1f}" if row["/episode/whole"] else f"{'-':>5}"
@@ -107,12 +110,17 @@ class TrainingLog:
                   f"learning {1e3 * learn_time:4.0f} ms", flush=True)  # fmt: skip
             self._print_faults(row)
 
-    def _log_elsewhere(self, row: dict[str, float], iteration: int) -> None:
-        """Write an iteration to TensorBoard and others; one that fails is a warning, and is left from then on."""
-        found = loggers.tags(row, self.env, self.frames) if self._open else {}
+    def write_elsewhere(self) -> None:
+        """Write the last iteration to TensorBoard and others; one that fails is a warning, and is left from then on.
+
+        A learner calls it while the device works on the next iteration; otherwise the next row does.
+        """
+        if self._later is None:
+            return
+        (found, iteration, when), self._later = self._later, None
         for name, logger in list(self._open.items()):
             try:
-                logger.log(found, iteration, time.time())
+                logger.log(found, iteration, when)
             except Exception as error:  # of another library: the training goes on
                 del self._open[name]
                 self.lost[name] = f"from iteration {iteration} on: {error}"
@@ -120,6 +128,7 @@ class TrainingLog:
 
     def close(self) -> None:
         """End other loggers."""
+        self.write_elsewhere()
         for name, logger in self._open.items():
             try:
                 logger.close()

@@ -453,7 +453,8 @@ class World:
     def keep(self, name: str, values: Any) -> None:
         """Set numbers of :meth:`memory`; a reset sets those without a :meth:`memory` call to zero.
 
-        What :class:`events.Start` and :class:`events.Reset` keep stays. A term that is a reward and an observation,
+        What :class:`events.Start` and :class:`events.Reset` keep stays. Numbers that no reset changes stay as they were
+        where new ones are not finite. A term that is a reward and an observation,
         too, keeps twice in a step; :meth:`sensor` does so once.
 
         Raises:

@@ -7,6 +7,8 @@ from typing import Any
 
 import torch
 
+from .arguments import check_written
+
 
 class WorldValues(Mapping[str, torch.Tensor]):
     """Values of the scene by name, tensors [world, ...], that may be written in place by torch.
@@ -20,11 +22,16 @@ class WorldValues(Mapping[str, torch.Tensor]):
         self.were_written()
 
     def __getitem__(self, name: str) -> torch.Tensor:
+        if name not in self._tensors:
+            raise KeyError(
+                f"env.values: no event changes {name!r}; expected one of [{', '.join(self)}], or an event that does, "
+                "such as events.randomise"
+            )
         return self._tensors[name]
 
     def __setitem__(self, name: str, value: Any) -> None:
-        held = self._tensors[name]
-        held.copy_(torch.as_tensor(value, dtype=held.dtype, device=held.device))
+        held = self[name]
+        held.copy_(check_written(f"env.values[{name!r}]", value, held))
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._tensors)

@@ -118,7 +118,13 @@ class Builder:
         return links
 
     def layout(
-        self, job: Job, stores: list[Store], everything: list[Store], sent: int = 0, warps: int = 1
+        self,
+        job: Job,
+        stores: list[Store],
+        everything: list[Store],
+        sent: int = 0,
+        warps: int = 1,
+        helps: bool = True,
     ) -> KernelLayout:
         """Return how a kernel holds its arrays.
 
@@ -126,6 +132,7 @@ class Builder:
             job: what it computes.
             stores: those of the result. everything: all that the kernel stores.
             sent: how many values its warps send each other. warps: how many share the worlds of a block.
+            helps: warps without other work may run what there is before substeps; not where all warps of a block vote.
         """
         routine, more = job.routine, job.more
         whole = "poses_out" in more
@@ -135,7 +142,7 @@ class Builder:
         room = self.room(wide, whole=whole)
         given = stores, everything, job.shapes, more, sent, warps, self.run.dtype
         before = tuple(code for code, _ in self.before) if SUBSTEPS in job.shapes else ()
-        helpers = self.plan.helpers(warps) if before else 0
+        helpers = self.plan.helpers(warps) if before and helps else 0
         return staging.choose_layout(*given, *ways, self.relays, room, wide, before, helpers)
 
     def room(self, wide: bool = False, whole: bool = False) -> int:

@@ -1,4 +1,4 @@
-"""What a solver in joint space reads of a scene: the order of its dofs, their axes and laws, and its pairs."""
+"""Tables that a solver in joint space reads of a scene: the order of its dofs, their axes and laws, and its pairs."""
 
 from __future__ import annotations
 
@@ -43,11 +43,14 @@ def joint_tables(
     slots: int,
     surfaces: list[range],
     motors: tuple[int, ...],
+    routines: list[int],
 ) -> JointTables:
     """Return the tables of a scene whose packed mass matrix has rows and columns ``pattern``.
 
     ``near``: pairs at most that are near in a world. ``slots``: points of pairs at most. ``surfaces``: of each point
-    with the ground, the numbers of the surfaces that it may touch. ``motors``: see :func:`motor_laws`.
+    with the ground, the numbers of the surfaces that it may touch. ``motors``: see :func:`motor_laws`. ``routines``: of
+    each pair the number of the routine that finds its points; pairs of one follow each other, so that threads of a warp
+    find the points of like pairs.
     """
     dofs_of = _dofs_by_body(scene)
     ways = _ways(scene)
@@ -55,18 +58,21 @@ def joint_tables(
     position = {dof: i for i, dof in enumerate(order) if dof >= 0}
     tiles = len(order) // 2
     couples, columns = _couples(scene, dofs_of, ways, position)
-    pairs = sorted(range(len(scene.contact_pairs)), key=lambda i: (couples[_bodies(scene, i)], i))
+    pairs = sorted(range(len(scene.contact_pairs)), key=lambda i: (routines[i], i))
     rows, cols = pattern
     sizes = joint_space.Sizes(
         scene.dof_count, tiles, len(rows), len(pairs), len(couples), max(map(len, columns), default=0), near,
         slots + sum(map(len, surfaces)), sum(map(len, surfaces)), len(surfaces), sum(motors),
     )  # fmt: skip
-    entries, masks = _entries(rows, cols, position, tiles)
+    held, masks = _held_tiles(rows, cols, position, tiles)
+    sizes = sizes._replace(held=1 + max(held))
+    entries = [4 * held[_tile(i, j)] + 2 * (i % 2) + j % 2 for i, j in _places(rows, cols, position)]
     coordinate, dof_values = _dofs(scene)
     own = [joint_space.DOF_VALUES.index(name) for name in ("stiffness", "ke", "kd")]
     dof_values[np.ix_(np.flatnonzero(motors), np.array(own))] = 0.0
     table: list[int] = [*order, *entries]
-    table += [(mask >> shift) & 0xFFFFFFFF for mask in masks for shift in range(0, 64 * sizes.words, 32)]
+    table += _words(masks, sizes.words) + held
+    table += _words([sum(1 << (column & 255) for column in each) for each in columns], sizes.words)
     for each in columns:
         table += [len(each), *each, *[0] * (sizes.columns - len(each))]
     for pair in pairs:
@@ -75,9 +81,9 @@ def joint_tables(
     table += [x for number in numbers for x in (couples[scene.contact_points[number].body, -1], number)]
     table += coordinate
     met: list[list[int]] = [[] for _ in order]  # entry and the other dof, of each dof
-    for entry, both in enumerate(zip(rows.tolist(), cols.tolist(), strict=True)):
-        for i, j in {tuple(both), tuple(both[::-1])}:
-            met[position[i]].append(entry << 8 | position[j])
+    for entry, (i, j) in zip(entries, _places(rows, cols, position), strict=True):
+        for one, other in {(i, j), (j, i)}:
+            met[one].append(entry << 8 | other)
     table += [*np.cumsum([0, *map(len, met)]).tolist(), *(x for row in met for x in sorted(row))]
     table += np.cumsum([0, *motors]).tolist()
     assert len(table) == sizes.table_starts["END"]
@@ -169,19 +175,20 @@ def _bodies(scene: Scene, pair: int) -> tuple[int, int]:
 def _order(scene: Scene, dofs_of: list[np.ndarray], ways: list[list[int]]) -> list[int]:
     """Return dofs in the order of elimination, each limb from an even place on; -1 fills.
 
-    Trees that touch many others come last, and children before what carries them, so that limbs fill nothing.
+    Trees that may touch others in many ways come last, and children before what carries them, so that limbs fill
+    nothing.
     """
     trees: dict[int, list[int]] = {}
     for body, way in enumerate(ways):
         trees.setdefault(way[-1], []).append(body)
-    met: dict[int, set[int]] = {root: set() for root in trees}
+    met = dict.fromkeys(trees, 0)
     for pair in scene.contact_pairs:
-        roots = [ways[body][-1] for body in (pair.body, pair.other) if body >= 0]
-        for root in roots:
-            met[root] |= set(roots) - {root}
+        roots = {ways[body][-1] for body in (pair.body, pair.other) if body >= 0}
+        for root in roots if len(roots) > 1 else ():
+            met[root] += 1
     order: list[int] = []
     sizes = {root: sum(len(dofs_of[body]) for body in bodies) for root, bodies in trees.items()}
-    for root in sorted(trees, key=lambda root: (len(met[root]), -sizes[root], root)):
+    for root in sorted(trees, key=lambda root: (met[root], -sizes[root], root)):
         children: dict[int, list[int]] = {body: [] for body in trees[root]}
         for body in trees[root]:
             if body != root:
@@ -221,16 +228,33 @@ def _couples(
     return couples, columns
 
 
-def _entries(rows: np.ndarray, cols: np.ndarray, position: dict[int, int], tiles: int) -> tuple[list[int], list[int]]:
-    """Return where each entry of the mass matrix goes, diagonal ones as ~place, and which tiles a column has."""
-    entries, masks = [], [0] * tiles
-    for row, col in zip(rows.tolist(), cols.tolist(), strict=True):
-        i, j = sorted((position[row], position[col]), reverse=True)
+def _places(rows: np.ndarray, cols: np.ndarray, position: dict[int, int]) -> list[tuple[int, int]]:
+    """Return row and column of each entry of the mass matrix, by places, in its lower triangle."""
+    both = [sorted((position[i], position[j])) for i, j in zip(rows.tolist(), cols.tolist(), strict=True)]
+    return [(high, low) for low, high in both]
+
+
+def _tile(i: int, j: int) -> int:
+    """Return which tile of the triangle two places have."""
+    return (i // 2) * (i // 2 + 1) // 2 + j // 2
+
+
+def _held_tiles(
+    rows: np.ndarray, cols: np.ndarray, position: dict[int, int], tiles: int
+) -> tuple[list[int], list[int]]:
+    """Return the number of each tile of the triangle among those of the mass matrix, or -1, and masks of columns."""
+    held, masks = [-1] * (tiles * (tiles + 1) // 2), [0] * tiles
+    for i, j in _places(rows, cols, position):
+        if held[_tile(i, j)] < 0:
+            held[_tile(i, j)] = 1 + max(held)
         if i // 2 != j // 2:
             masks[j // 2] |= 1 << (i // 2)
-        tile = (i // 2) * (i // 2 + 1) // 2 + j // 2
-        entries.append(~i if i == j else 4 * tile + 2 * (i % 2) + j % 2)
-    return entries, masks
+    return held, masks
+
+
+def _words(masks: list[int], words: int) -> list[int]:
+    """Return masks in so many words of 32 bits each."""
+    return [(mask >> shift) & 0xFFFFFFFF for mask in masks for shift in range(0, 32 * words, 32)]
 
 
 def _dofs(scene: Scene) -> tuple[list[int], np.ndarray]:

@@ -91,6 +91,25 @@ def check_results(
     run.launch(result_check.check_results, run.worlds * lanes, inputs, [status])
 
 
+def words_of_states(scene: Scene, q: np.ndarray, words: np.ndarray) -> np.ndarray:
+    """Return status words [step] of steps, and where q [step, coordinate] before a step is the reason, the word for it.
+
+    These are the words of :func:`check_results` for the states that a call was given.
+    """
+    kinds, (least, most), tiny = (
+        kinds_of_coordinates(scene),
+        result_check.SQUARES[wp.float32],
+        kernels.NORMAL[wp.float32][0],
+    )
+    far = (np.abs(q[:, kinds == result_check.ANGLE]) > result_check.FARTHEST).any(axis=1)
+    firsts = np.flatnonzero(kinds == result_check.ROTATION)
+    with np.errstate(over="ignore"):
+        squares = (q[:, firsts[:, None] + np.arange(4)].astype(np.float32) ** 2).sum(axis=2)
+    far |= ((squares < least) | (squares > most)).any(axis=1)
+    found = np.where(far & (words != result_check.NOT_FINITE), result_check.RANGE, words)
+    return np.where((squares < tiny).any(axis=1), result_check.QUATERNION, found).astype(np.int32)
+
+
 def kinds_of_coordinates(scene: Scene) -> np.ndarray:
     """Return what each coordinate is to the reduction of angles and quaternions [coordinate], int32."""
     kinds = np.zeros(scene.coord_count, dtype=np.int32)

@@ -92,10 +92,10 @@ class JaxOperation:
         """Return arguments of one call, its results, and what it writes: the status, and what the derivative keeps."""
         keeps = self.operation.derivative.keeps if keep and self.operation.derivative else ()
         given, written = self._samples(), self._arrays_to_write((*self._status, *keeps))
-        results = self._compute(given, **written, **self._added(keep))
+        results = self._compute(given, **written, **self._further_options(keep))
         return given, (results,) if self.count == 1 else tuple(results), written
 
-    def _added(self, keep: bool) -> dict[str, Any]:
+    def _further_options(self, keep: bool) -> dict[str, Any]:
         """Return the options that a call with a way back has besides those of the caller."""
         derivative = self.operation.derivative
         return derivative.adds(self.dyn) if keep and derivative is not None else {}
@@ -103,7 +103,7 @@ class JaxOperation:
     def _forward(self, keep: bool) -> Traced:
         """Return the operation as a JAX function; its results are followed by what else it writes."""
         given, results, written = self._run_once(keep)
-        added = self._added(keep)
+        added = self._further_options(keep)
 
         def run(inputs: Arrays, outputs: Arrays) -> None:
             for part in self._parts(inputs[0].shape[0]):

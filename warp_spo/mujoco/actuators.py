@@ -9,7 +9,7 @@ import numpy as np
 
 from ..scene.actuators import UNBOUNDED, Actuator
 from .equality_constraints import fixed_tendon
-from .mechanism import SIZES, Mechanism, actuator_output
+from .mechanism import SIZES, TO_JOINT, Mechanism, actuator_output
 from .source import Source
 
 WORDS = {
@@ -18,7 +18,6 @@ WORDS = {
     "mjTRN_BODY": "a body transmission (adhesion)",
     "mjTRN_SO3": "a transmission of orientation",
 }
-TO_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 TO_TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 WAY_OUT = "remove it, or compute its force and pass it as tau"
 

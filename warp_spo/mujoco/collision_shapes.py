@@ -51,7 +51,7 @@ def collision_shapes(source: Source, moving: np.ndarray) -> list[CollisionShape]
         ground = touched[0] if touched else None
         shape = geom_shape(source, geom, None, _margin(source, geom, ground, pairs))
         material = _frictions(source, geom, ground, pairs)
-        found.append(dataclasses.replace(shape, **material, unread=_unread_softness(source, geom, ground, pairs)))
+        found.append(dataclasses.replace(shape, **material, unread=_unread_material(source, geom, ground, pairs)))
     return found
 
 
@@ -94,7 +94,7 @@ def pair_of_geoms(source: Source, one: CollisionShape, other: CollisionShape, pa
     margin, lent = (
         (_margin(source, a, b, pairs), 0.0) if explicit else (_margin(source, g, None, pairs) for g in (a, b))
     )
-    unread = _unread_softness(source, a, b, pairs)
+    unread = _unread_material(source, a, b, pairs)
     first = dataclasses.replace(one, **_frictions(source, a, b, pairs), rounding=margin, unread=unread)
     return ShapePair(first, dataclasses.replace(other, rounding=lent))
 
@@ -111,7 +111,7 @@ def _frictions(source: Source, geom: int, ground: int | None, pairs: Pairs) -> d
                 source.left_out.append(f"{words}, which has {value:g} in all directions")
         values = slide, torsional, roll
     else:
-        both = _counting(m, geom, ground)
+        both = _take_by_priority(m, geom, ground)
         values, dimensions = m.geom_friction[both].max(axis=0), m.geom_condim[both].max()
     if source.enabled("OVERRIDE"):
         values = m.opt.o_friction[[0, 2, 3]]
@@ -119,15 +119,18 @@ def _frictions(source: Source, geom: int, ground: int | None, pairs: Pairs) -> d
     return {name: float(value) if dimensions >= least else 0.0 for name, value, least in leasts}
 
 
-def _counting(m: Any, geom: int, ground: int | None) -> list[int]:
+def _take_by_priority(m: Any, geom: int, ground: int | None) -> list[int]:
     """Return the geoms of a contact that give it its values: those of the highest priority."""
     both = [geom] if ground is None else [geom, ground]
     priority = max(m.geom_priority[g] for g in both)
     return [g for g in both if m.geom_priority[g] == priority]
 
 
-def _unread_softness(source: Source, geom: int, ground: int | None, pairs: Pairs) -> str:
-    """Return which of MuJoCo's values for the softness of a geom's contact with a ground are not its defaults."""
+def _unread_material(source: Source, geom: int, ground: int | None, pairs: Pairs) -> str:
+    """Return which values that MuJoCo gives to a geom's contact with a ground are not its defaults, and not read.
+
+    They are those of the softness, surfaces that move or stick, and a gap below zero, within which nothing pushes.
+    """
     m = source.model
     pair = None if ground is None else pairs.get(frozenset((geom, ground)))
     if source.enabled("OVERRIDE"):
@@ -135,8 +138,14 @@ def _unread_softness(source: Source, geom: int, ground: int | None, pairs: Pairs
     elif pair is not None:
         rows = {name: [getattr(m, f"pair_{name}")[pair]] for name in SOFTNESS}
     else:
-        rows = {name: getattr(m, f"geom_{name}")[_counting(m, geom, ground)] for name in ("solref", "solimp")}
-    return ", ".join(name for name, values in rows.items() if (np.array(values) != SOFTNESS[name]).any())
+        rows = {name: getattr(m, f"geom_{name}")[_take_by_priority(m, geom, ground)] for name in ("solref", "solimp")}
+    found = [name for name, values in rows.items() if (np.array(values) != SOFTNESS[name]).any()]
+    both = [geom] if ground is None else [geom, ground]
+    part, elements = ("geom", both) if pair is None else ("pair", [pair])
+    surfaces, sticky, gaps = (source.field(name) for name in ("geom_surfacevel", f"{part}_adhesion", f"{part}_gap"))
+    found += ["surfacevel"] if surfaces is not None and surfaces[both].any() else []  # MuJoCo 3 has none of the two
+    found += ["adhesion"] if sticky is not None and sticky[elements].any() else []
+    return ", ".join([*found, "gap"] if gaps is not None and gaps[elements].sum() < 0.0 else found)
 
 
 def _margin(source: Source, geom: int, ground: int | None, pairs: Pairs) -> float:

@@ -20,6 +20,8 @@ from .source import Source
 
 FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{n}")) for n in ("FREE", "BALL", "SLIDE", "HINGE"))
 KINDS = {FREE: "free", BALL: "ball", SLIDE: "prismatic", HINGE: "revolute"}
+TO_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+"""Transmissions of actuators to a joint."""
 SIZES = {FREE: (7, 6), BALL: (4, 3), SLIDE: (1, 1), HINGE: (1, 1)}
 """Entries of qpos and of qvel by joint type."""
 ROUNDING = 8 * np.finfo(np.float64).eps
@@ -38,7 +40,6 @@ class Mechanism:
     Attributes:
         bodies, hinges: of the scene.
         hinge_of: index of the hinge by joint of the model; joints that ``floating`` replaced are not in it.
-        starts: coordinates at which a free hinge that ``floating`` added stands in the file, by hinge.
     """
 
     def __init__(self, source: Source, floating: bool | None = None):
@@ -48,7 +49,6 @@ class Mechanism:
         self.bodies = [self._body(body) for body in range(1, model.nbody)]
         self.hinges: list[Hinge] = []
         self.hinge_of: dict[int, int] = {}
-        self.starts: dict[int, np.ndarray] = {}
         for body in range(1, model.nbody):
             if floating is not None and self._replaces(body, floating):
                 self._replace(body, floating)
@@ -130,12 +130,14 @@ class Mechanism:
         values = self._dof_values(joint) | {"label": label, "rest": scene_entries(kind, m.qpos_spring, adr)}
         if kind == FREE:
             return Hinge("free", parent, child, **values)
-        at = composed(pose, (*anchor, *UPRIGHT))
+        at = compose_poses(pose, (*anchor, *UPRIGHT))
         back = (*anchor, *UPRIGHT)
         if kind == BALL:
             return Hinge("ball", parent, child, parent_pose=at, child_pose=back, **values)
         ref = -float(m.qpos0[adr])  # the anchor is where the child stands at zero
-        at = composed(at, (*(axis * ref), *UPRIGHT) if kind == SLIDE else (0.0, 0.0, 0.0, *turned_about(axis, ref)))
+        at = compose_poses(
+            at, (*(axis * ref), *UPRIGHT) if kind == SLIDE else (0.0, 0.0, 0.0, *turned_about(axis, ref))
+        )
         return Hinge(KINDS[kind], parent, child, axis=axis, parent_pose=at, child_pose=back, **values)
 
     @functools.cached_property
@@ -168,14 +170,16 @@ class Mechanism:
         return values
 
     def _actuator_values(self, joint: int) -> dict[str, float]:
-        """Return the armature and damping of the actuator that gives them to a joint, seen through its gear."""
-        m, owner = self.source.model, self.source.field("jnt_actuatorid")
-        if owner is None or owner[joint] < 0:
-            return {}
-        actuator = int(owner[joint])
-        gear = float(m.actuator_gear[actuator_output(self.source, actuator), 0])
-        found = {name: self.source.field(f"actuator_{name}") for name in ("armature", "damping")}
-        return {name: gear**2 * float(values[actuator]) for name, values in found.items() if values is not None}
+        """Return the armature and damping that actuators give to a joint, each seen through its gear."""
+        m, source = self.source.model, self.source
+        found = {name: source.field(f"actuator_{name}") for name in ("armature", "damping")}
+        on_joint = np.isin(m.actuator_trntype, TO_JOINT) & (m.actuator_trnid[:, 0] == joint)
+        gears = {int(a): float(m.actuator_gear[actuator_output(source, int(a)), 0]) for a in np.flatnonzero(on_joint)}
+        return {
+            name: sum(gear**2 * float(values[actuator]) for actuator, gear in gears.items())
+            for name, values in found.items()
+            if values is not None
+        }
 
     # -- another base ----------------------------------------------------------------------------------------------
     def _replaces(self, body: int, floating: bool) -> bool:
@@ -191,7 +195,6 @@ class Mechanism:
     def _replace(self, body: int, floating: bool) -> None:
         pose, own = body_pose(self.source.model, body), self._label(body)
         if floating:
-            self.starts[len(self.hinges)] = pose
             self.hinges.append(Hinge("free", -1, body - 1, rest=pose, label=self._joint_label(f"{own}_free")))
         else:
             self.hinges.append(Hinge("fixed", -1, body - 1, parent_pose=pose, label=self._joint_label(f"{own}_fixed")))
@@ -234,7 +237,7 @@ def turned_about(axis: np.ndarray, angle: float) -> np.ndarray:
     return xyzw(quaternion)
 
 
-def composed(outer: Any, inner: Any) -> np.ndarray:
+def compose_poses(outer: Any, inner: Any) -> np.ndarray:
     """Return the pose ``inner``, given in the pose ``outer``; both are x, y, z and a quaternion x, y, z, w."""
     place, turn = np.empty(3), np.empty(4)
     quaternion = wxyz(outer[3:])

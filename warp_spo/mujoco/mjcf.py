@@ -29,18 +29,18 @@ def read_mjcf(file: Path, floating: bool | None, repair: bool = True, selection:
         raise ValueError(
             f"load: {str(file)!r} holds <{shown(tag)}>; expected <mujoco>; if it is URDF, let its name end in .urdf"
         )
-    model, dropped, missing = compiled(file)
+    model, dropped, missing = compiled(file, bool(floating))
     source = Source(model, "load", str(file), missing)
     source.left_out += dropped
     return scene_of(source, floating, selection)
 
 
-def compiled(file: Path) -> tuple[mujoco.MjModel, list[str], dict[int, str]]:
+def compiled(file: Path, floating: bool = False) -> tuple[mujoco.MjModel, list[str], dict[int, str]]:
     """Return MuJoCo's model of a file, in words what had to be dropped from it, and by geom what cannot be read of it.
 
     A file that MuJoCo refuses is compiled again without sensors, skins and textures, and without the meshes and height
     fields that give no body its mass, at last without contact pairs: a scene needs none of them, and files are often
-    without them.
+    without them. With ``floating`` bodies without joints move, too, so that their masses count.
     """
     try:
         return mujoco.MjModel.from_xml_path(os.fspath(file)), [], {}
@@ -49,7 +49,7 @@ def compiled(file: Path) -> tuple[mujoco.MjModel, list[str], dict[int, str]]:
     for unneeded in (UNNEEDED, (*UNNEEDED, *OF_CONTACT)):
         try:
             spec = mujoco.MjSpec.from_file(os.fspath(file))
-            dropped, shapeless = _drop(spec, unneeded)
+            dropped, shapeless = _drop(spec, unneeded, floating)
             model = spec.compile()
         except REFUSALS as error:
             last = error
@@ -72,7 +72,7 @@ REFUSALS = (ValueError, RuntimeError, MemoryError, mujoco.FatalError, mujoco.Une
 UNNEEDED, OF_CONTACT = ("sensors", "skins", "tuples"), ("pairs", "excludes")
 
 
-def _drop(spec: Any, unneeded: tuple[str, ...]) -> tuple[list[str], list[tuple[Any, str]]]:
+def _drop(spec: Any, unneeded: tuple[str, ...], floating: bool) -> tuple[list[str], list[tuple[Any, str]]]:
     """Take from a specification what changes no mass and no joint.
 
     Returns:
@@ -92,7 +92,7 @@ def _drop(spec: Any, unneeded: tuple[str, ...]) -> tuple[list[str], list[tuple[A
         texture.nchannel = 3
     shapeless = []
     for geom in spec.geoms:
-        if (geom.meshname or geom.hfieldname) and _gives_no_mass(spec, geom):
+        if (geom.meshname or geom.hfieldname) and _gives_no_mass(spec, geom, floating):
             shapeless.append((geom, f"{'mesh' if geom.meshname else 'height field'} that MuJoCo cannot read"))
             geom.type, geom.size = mujoco.mjtGeom.mjGEOM_SPHERE, [1e-3, 0.0, 0.0]
             geom.meshname = geom.hfieldname = ""
@@ -105,7 +105,7 @@ def _drop(spec: Any, unneeded: tuple[str, ...]) -> tuple[list[str], list[tuple[A
     return dropped, shapeless
 
 
-def _gives_no_mass(spec: Any, geom: Any) -> bool:
+def _gives_no_mass(spec: Any, geom: Any, floating: bool) -> bool:
     """Whether a geom changes no body that can move: its body stands still, has an <inertial>, or takes none from it."""
     always, never = (
         spec.compiler.inertiafromgeom == getattr(mujoco.mjtInertiaFromGeom, f"mjINERTIAFROMGEOM_{name}")
@@ -118,7 +118,7 @@ def _gives_no_mass(spec: Any, geom: Any) -> bool:
     if body.explicitinertial and not always:
         return True
     while body.name != "world":  # whose parent is None in MuJoCo 4 and no body at all in 3.11
-        if body.joints:
+        if floating or body.joints:
             return False
         body = body.parent
     return True

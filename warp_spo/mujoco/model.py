@@ -139,8 +139,9 @@ def state_of(source: Source, mechanism: Mechanism, qpos: np.ndarray, qvel: np.nd
     q, qd = [np.zeros(0)], [np.zeros(0)]
     for index, hinge in enumerate(mechanism.hinges):
         if index not in joint_of:
-            start = mechanism.starts.get(index, np.zeros(0))
-            q, qd = [*q, start], [*qd, np.zeros(hinge.dof_count)]
+            if hinge.dof_count:  # a base that the caller set free
+                pose, rates = _motion_of_body(m, hinge.child + 1, qpos, qvel)
+                q, qd = [*q, pose], [*qd, rates]
             continue
         joint = joint_of[index]
         kind, adr, dof = int(m.jnt_type[joint]), int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])
@@ -155,6 +156,17 @@ def state_of(source: Source, mechanism: Mechanism, qpos: np.ndarray, qvel: np.nd
     return np.concatenate(q), np.concatenate(qd)
 
 
+def _motion_of_body(m: Any, body: int, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pose of a body and its velocity, that of its centre of mass first, as of a free hinge."""
+    data, twist = mujoco.MjData(m), np.zeros(6)
+    data.qpos, data.qvel = qpos, qvel
+    mujoco.mj_kinematics(m, data)
+    mujoco.mj_comPos(m, data)
+    mujoco.mj_comVel(m, data)
+    mujoco.mj_objectVelocity(m, data, mujoco.mjtObj.mjOBJ_BODY, body, twist, 0)
+    return np.concatenate([data.xpos[body], xyzw(data.xquat[body])]), np.concatenate([twist[3:], twist[:3]])
+
+
 def _softness(source: Source) -> Iterator[str]:
     """Yield which equalities and frictions of joints, exact in a scene, have a softness of their own."""
     m = source.model
@@ -164,15 +176,15 @@ def _softness(source: Source) -> Iterator[str]:
     if m.neq and not source.disabled("EQUALITY"):
         used = np.flatnonzero(m.eq_active0.astype(bool) & (soft("eq", "solref") | soft("eq", "solimp")))
         if used.size:
-            yield f"the softness (solref, solimp) of {_listed(source, 'equality', used)} (they hold exactly)"
+            yield f"the softness (solref, solimp) of {_list_some(source, 'equality', used)} (they hold exactly)"
     if m.nv and not source.disabled("FRICTIONLOSS"):
         dofs = (m.dof_frictionloss > 0.0) & (soft("dof", "solref") | soft("dof", "solimp"))
         if dofs.any():
-            names = _listed(source, "joint", np.unique(m.dof_jntid[dofs]))
+            names = _list_some(source, "joint", np.unique(m.dof_jntid[dofs]))
             yield f"the softness (solreffriction, solimpfriction) of the friction of {names}"
 
 
-def _listed(source: Source, kind: str, indices: np.ndarray) -> str:
+def _list_some(source: Source, kind: str, indices: np.ndarray) -> str:
     """Return the first eight of some elements in words, and the number of the others."""
     more = f" and {len(indices) - 8} more" if len(indices) > 8 else ""
     return ", ".join(source.words(kind, int(index)) for index in indices[:8]) + more

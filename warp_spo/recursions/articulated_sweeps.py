@@ -29,7 +29,7 @@ MANY = 8  # children of a link whose contributions are worth a loop
 
 @dataclasses.dataclass(frozen=True)
 class StepTerms:
-    """What a time step adds to the equations of motion of links.
+    """Terms that a time step adds to the equations of motion of links.
 
     Attributes:
         with_armature: returns a link with what the laws of its joints add to its armature.

@@ -112,13 +112,13 @@ class PosedPair:
     def least(self, samples=SAMPLES, improve=True):
         """Return the least overlaps; without ``improve``, those of round shapes are of samples alone."""
         exact = self._is_exact()
-        n = self._axes() if exact else np.concatenate([self._axes(), self._sampled(samples)], axis=1)
+        n = self._axes() if exact else np.concatenate([self._axes(), self.sample_directions(samples)], axis=1)
         s = self.overlap(n)
         if exact or not improve:
             best = s.argmin(axis=1)
             pose = np.arange(len(s))
             return Overlaps(s[pose, best], n[pose, best])
-        return self._improved(n, s)
+        return self._improve_directions(n, s)
 
     def _is_exact(self):
         """Return whether normals of faces and what is across edges are all directions that count."""
@@ -137,7 +137,7 @@ class PosedPair:
         across = np.where(length > 1e-6, across / np.maximum(length, 1e-6), [1.0, 0.0, 0.0])
         return np.concatenate([-up_a @ turn_a, up_b @ turn_b, across, -across], axis=1)
 
-    def _sampled(self, count):
+    def sample_directions(self, count):
         """Return directions over the sphere, the same for all poses."""
         height = 1.0 - (2.0 * np.arange(count) + 1.0) / count
         angle = np.pi * (1.0 + 5.0**0.5) * np.arange(count)
@@ -145,7 +145,7 @@ class PosedPair:
         n = np.stack([across * np.cos(angle), across * np.sin(angle), height], axis=1)
         return np.broadcast_to(n, (len(self.place), count, 3))
 
-    def _improved(self, n, s):
+    def _improve_directions(self, n, s):
         """Return the best of the STARTS best directions after ROUNDS of tries around each."""
         pose = np.arange(len(s))[:, None]
         first = np.argpartition(s, STARTS, axis=1)[:, :STARTS]

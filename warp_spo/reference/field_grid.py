@@ -6,7 +6,7 @@ cylinder that stands is a disc, with RIM edges, and one that lies is a capsule w
 depth, negative outside. The deepest of each quadrant of the shape are rows of their own: of two the first found
 counts, unless the other is deeper by more than TIE, where being farther out counts as deeper by OUTWARD of that.
 
-What is found is discrete: which point or line, and which face or edge. Where it lies follows from the pose and heights.
+The results are discrete: which point or line, and which face or edge. Where it lies follows from the pose and heights.
 """
 
 import numpy as np

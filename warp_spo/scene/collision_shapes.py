@@ -40,7 +40,8 @@ AXIS_TOLERANCE = 1e-6  # by which axes of a height field may differ from the ine
 GROUNDS = ("plane", "height field")
 NAMED = 6  # shapes of one kind that a warning names
 MATERIAL_VALUES = (
-    "stiffness and damping are chosen; scene.with_values(contact_stiffness=, contact_damping=) sets others"
+    "contacts have none; stiffness and damping are chosen, and scene.with_values(contact_stiffness=, "
+    "contact_damping=) sets others"
 )
 NO_GROUND = (
     "all contacts with a ground, because there is no plane and no height field to touch (ground=spo.Plane() adds a "

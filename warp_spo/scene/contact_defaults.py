@@ -1,6 +1,6 @@
 """The rule by which contacts get stiffness and damping where a user gives none.
 
-What rests on a contact is known only as the weight of all that may stand there: the tree of its body, and the trees
+The load of a contact is known only as the weight of all that may stand there: the tree of its body, and the trees
 that pairs connect with it. At rest under that load on up to four points, a body sinks by STATIC_SINK, or less where it
 is small or narrow. Damping is stiffness times DAMPING_TIME, whatever the masses: it bounds the speed at which something
 that is found deep inside comes out, by the depth over that time.

@@ -48,8 +48,8 @@ class Hull(NamedTuple):
 
     @property
     def grid_table(self) -> tuple[float, ...]:
-        """What a search of a field's grid reads: the number of faces, their planes, and then of each edge its middle
-        (3), unit direction (3), half its length, and the normals of its faces (6)."""
+        """The numbers that a search of a field's grid reads: the number of faces, their planes, then of each edge its
+        middle (3), unit direction (3), half its length, and the normals of its faces (6)."""
         first: dict[tuple[int, int], int] = {}
         found = [float(len(self.faces)), *self.planes]
         for number, face in enumerate(self.faces):

@@ -93,12 +93,12 @@ def pair_values(pair: ContactPair, scene: Any, neutral: NeutralPose) -> tuple[fl
             (body, shape) for body, shape in zip((pair.body, pair.other), pair.shapes, strict=True) if body in moving
         ]
         sink = min((neutral.sink(body, neutral.on(body, shape.samples), 0.0) for body, shape in sides), default=1.0)
-        k = chosen_stiffness((max(loads) + _pressing(pair, scene)) / sink, min(masses))
+        k = chosen_stiffness((max(loads) + _sum_pressing_efforts(pair, scene)) / sink, min(masses))
     d = DAMPING_TIME * k if contact.damping is None else contact.damping
     return contact.friction, float(k), float(d)
 
 
-def _pressing(pair: ContactPair, scene: Any) -> float:
+def _sum_pressing_efforts(pair: ContactPair, scene: Any) -> float:
     """Return the sum of the effort limits of prismatic joints between the bodies of a pair [N]."""
     ways: list[set[int]] = []
     most = scene.values["joint_effort_limit"][0]

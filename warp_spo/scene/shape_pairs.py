@@ -146,7 +146,7 @@ class PairSelection:
 
     def missed(self, why: str = "") -> list[str]:
         """Return in words that the scene has no contacts of bodies which may touch each other; nothing without any."""
-        pairs = self._touching()
+        pairs = self._find_touching()
         if not pairs:
             return []
         way = "pairs=[...] takes those that matter by names" if why else "pairs='all' takes them"
@@ -173,14 +173,14 @@ class PairSelection:
         What stands still is in one only if ``takes_still`` says so, and no ground is. Pairs that overlap in the neutral
         pose are among them, and those that joint limits keep apart.
         """
-        return [self._ordered(*pair) for pair in self._touching()]
+        return [self._order_pair(*pair) for pair in self._find_touching()]
 
-    def _touching(self) -> list[tuple[CollisionShape, CollisionShape]]:
+    def _find_touching(self) -> list[tuple[CollisionShape, CollisionShape]]:
         """Return the shapes of every pair that may touch."""
         solid = [one for one in self.shapes if self.moves(one) or (self.takes_still and one.kind not in GROUNDS)]
         return [pair for pair in combinations(solid, 2) if self._may_touch(*pair)]
 
-    def _ordered(self, a: CollisionShape, b: CollisionShape) -> ShapePair:
+    def _order_pair(self, a: CollisionShape, b: CollisionShape) -> ShapePair:
         """Return the pair of two shapes, that which moves first."""
         return self.as_pair(a, b) if self.moves(a) else self.as_pair(b, a)
 
@@ -213,7 +213,7 @@ class PairSelection:
     def _named_pairs(self, names: Sequence[Any]) -> list[ShapePair]:
         """Return the pairs that two names stand for."""
         sides = [self._shapes_of_name(name) for name in names]
-        both = [self._ordered(a, b) for a, b in product(*sides) if a.index != b.index]
+        both = [self._order_pair(a, b) for a, b in product(*sides) if a.index != b.index]
         pairs = [pair for pair in both if self._may_touch(*pair)]
         bodies, what = self.scene.body_labels, f"pairs={tuple(names)!r}"
         if not pairs:

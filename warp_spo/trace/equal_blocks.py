@@ -1,8 +1,8 @@
 """Statements that stand once for all links whose computation is alike, in a loop over a table of their differences.
 
 The statements of a link between two others are a block. Blocks of equal text, but for numbers, array entries and names
-of values, become one loop. What a block leaves to others goes through an array of the thread, :data:`KEPT`; entries
-are used again once nobody reads their value any more. The order of all statements stays, so results keep their bits.
+of values, become one loop. Values that a block leaves to others go through an array of the thread, :data:`KEPT`;
+entries are used again once nobody reads their value any more. All statements keep their order, results their bits.
 """
 
 from __future__ import annotations

@@ -117,7 +117,11 @@ def _imported(file: Path, scene: Scene) -> Appearance:
 
         stage = Usd.Stage.Open(str(file))
         unit = float(UsdGeom.GetStageMetersPerUnit(stage))
-        builder.add_usd(stage, load_sites=False)
+        with warnings.catch_warnings():
+            warnings.filterwarnings(
+                "ignore", "USD stages with non-unit", newton.NewtonWarning
+            )
+            builder.add_usd(stage, load_sites=False)
     body_of = {label: body for body, label in enumerate(scene.body_labels)}
     rows = {row: body_of[label] for row, label in enumerate(builder.body_label) if label in body_of}
     found = _newton_shapes(builder, rows, unit)
@@ -133,10 +137,13 @@ def urdf_with_files(file: Path) -> tuple[str, list[str]]:
     Files are found as :func:`warp_spo.load` finds them, which asks no network. Shapes whose
     files are missing are left out.
     """
+    from ..newton.files.urdf import origin_of
     from ..newton.files.urdf_masses import mesh_file, unit_of
+    from ..newton.files.urdf_up_axis import turn_meshes
     from ..newton.files.xml_source import read_xml
 
     robot, missing = read_xml(file), dict[str, None]()
+    turn_meshes(robot, origin_of)
     for link in robot.findall("link"):
         for shape in [*link.findall("visual"), *link.findall("collision")]:
             found: Any

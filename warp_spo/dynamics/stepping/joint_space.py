@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from ...execution.joint_tables import joint_tables, lacking, motor_laws, way_out
-from ...execution.routine import Routine
-from ...kernels import convex_pairs, joint_space, near_pairs
+from ...execution.routine import Routine, SegmentForm, TuningHints
+from ...kernels import convex_pairs, convex_shapes, joint_space, near_pairs
 from ...recursions.contact import coupled, joint_system
 from ...recursions.contact.pairs import PASSES
 from ...recursions.contact.points import surface_numbers
@@ -21,11 +21,12 @@ from ...scene.ground import HEIGHTS
 from ...scene.scene import Scene
 from ..convex_contacts import PairShape, rotate, shape_rows
 from ..inertia import MASS_MATRIX_PACKED
-from ..kinematics import BODY_STATES
 
 if TYPE_CHECKING:
     from ..dynamics import Dynamics
 
+STATES = Routine("joint_states", joint_system.joint_states, segments=SegmentForm(wide=True))
+BIAS = Routine("joint_bias", joint_system.joint_bias, segments=SegmentForm(messages="z"), hints=TuningHints(short=True))
 SYSTEM = Routine("joint_system", joint_system.joint_system)
 STATE_AFTER = Routine("joint_state_after", joint_system.state_after)
 FEW, MOST_SHARED, NARROW = 8192, 96 * 1024, 16
@@ -39,9 +40,11 @@ NO_ROOM = "more dofs and contacts than the shared memory of the GPU holds of a w
 NO_ROOM_WAY = "use dtype='float32', or list fewer pairs"
 NEAR, NEAR_A_BODY = 256, 4
 """Pairs that may be near in a world: so many, or so many for each body of a pair. One takes 240 bytes in float32."""
-FULL, LEAST, LEAST_A_BODY = 8, 16, 2
+FULL, LEAST, LEAST_A_BODY, A_TREE = 8, 16, 2, 4
 """Of FULL pairs, or of as many as there are bodies of a pair, all points have slots. In a pile a body lies on one or
-two others, mostly with four points. Where shared memory is short, LEAST slots, or LEAST_A_BODY for each body, stay."""
+two others, mostly with four points. Where shared memory is short, LEAST slots, or LEAST_A_BODY for each body, stay.
+On a GPU worlds with up to A_TREE points for each tree of bodies have a kernel with no more slots, of which many run
+at once."""
 
 
 def is_generated(dyn: Dynamics) -> bool:
@@ -91,6 +94,11 @@ def choose_slots(scene: Scene) -> tuple[int, int]:
     return min(len(pairs), max(NEAR, NEAR_A_BODY * len(bodies))), sum(points[: max(FULL, len(bodies))])
 
 
+def _routine(one: ConvexShape, other: ConvexShape) -> int:
+    """Return the number of the routine that finds the points of two shapes."""
+    return convex_pairs.routine(*(convex_shapes.KINDS.index(_pair_shape(shape).kind) for shape in (one, other)))
+
+
 def _points(one: ConvexShape, other: ConvexShape) -> int:
     """Return how many points two shapes share at most."""
     round_ones = [shape.kind == SWEPT_SEGMENT and shape.size[2] == 0.0 for shape in (one, other)]
@@ -105,11 +113,12 @@ class JointSpaceStep:
     Args:
         dyn: of the scene.
         near: pairs of shapes at most that are near each other in a world. slots: points of these at most. None: as
-            :func:`choose_slots` says; fewer where shared memory is too small for a world.
+            :func:`choose_slots` says.
         lanes: threads of a world on a GPU: 8, 16 or 32; None: by the number of worlds.
         registers: of a thread at most; None: as the compiler chooses.
         margin: how near shapes must be to be looked at where nothing moves [m].
         refine: steps of iterative refinement in the last pass; None: one in float32.
+        few: points of pairs up to which a world has a kernel with no more slots; None: as A_TREE says.
     """
 
     def __init__(
@@ -121,6 +130,7 @@ class JointSpaceStep:
         registers: int | None = None,
         margin: float = MARGIN,
         refine: int | None = None,
+        few: int | None = None,
     ):
         scene: Scene = dyn.scene
         T: Any = dyn.dtype
@@ -130,16 +140,20 @@ class JointSpaceStep:
         self.near_count = near = chosen[0] if near is None else near
         self.slot_count = slots = chosen[1] if slots is None else slots
         pattern = dyn.mass_matrix_pattern
-        surfaces = surface_numbers(scene, HEIGHTS in dyn.variable)
+        surfaces, pairs = surface_numbers(scene, HEIGHTS in dyn.variable), scene.contact_pairs
         self.motor_laws = motors = motor_laws(scene, dyn.variable)
-        tables = joint_tables(scene, pattern, near, slots, surfaces, motors)
+        tables = joint_tables(scene, pattern, near, slots, surfaces, motors, [_routine(*x.shapes) for x in pairs])
         sizes = tables.sizes
         least = min(slots, max(LEAST, LEAST_A_BODY * len(scene.bodies)))
         while self.device.is_cuda and slots > least and joint_space.world_bytes(sizes, T) > ROOM:
             self.slot_count = slots = max(least, slots - 8)
             sizes = sizes._replace(slots=slots + sizes.surfaces)
+        if few is None:
+            few = A_TREE * sum(parent < 0 for parent in scene.tree.parent) if self.device.is_cuda else slots
+        few = min(few, slots) + sizes.surfaces
+        parts = [sizes._replace(slots=few, leaves=True), sizes._replace(least=few)] if few < sizes.slots else [sizes]
         self.tables = tables = tables._replace(sizes=sizes)
-        crowded = 2 * joint_space.world_bytes(sizes, T) > MOST_SHARED
+        crowded = 2 * joint_space.world_bytes(parts[0], T) > MOST_SHARED
         narrow = scene.dof_count <= NARROW and not crowded
         self.lanes = lanes or (32 if crowded or (dyn.worlds <= FEW and not narrow) else 16)
         array: Any = functools.partial(wp.array, dtype=T, device=self.device)
@@ -170,9 +184,11 @@ class JointSpaceStep:
         weight = float(scene.values["body_mass"].sum(axis=1).max()) * 9.81
         effort = float(efforts[efforts > 0.0].min()) if (efforts > 0.0).any() else 1.0
         self.tolerances = [TOLERANCE * weight, TOLERANCE * effort]
-        self.solver = joint_space.solver(
-            sizes, T, self.lanes, registers, int(T is wp.float32) if refine is None else refine
-        )
+        self.solvers = []
+        for part, threads in zip(parts, (self.lanes, 32), strict=False):
+            refined = int(T is wp.float32) if refine is None else refine
+            kernel = joint_space.solver(part, T, threads, registers, refined)
+            self.solvers.append((kernel, threads, joint_space.threads_of_block(part, T, threads)))
         self._make_shapes(array)
         self.broad = near_pairs.broad(sizes.pairs, near, T)
 
@@ -249,19 +265,20 @@ class JointSpaceStep:
         system += [self.motors, self.dof_values, self.pair_values, self.place]
         names = "qd_out", "qdd", "contact_f", "contact_gap", "contact_slip", "excess", "status"
         out = [(results or {}).get(name, getattr(self, name)) for name in names]
-        a_world = self.lanes if self.device.is_cuda else 1
         numbers = [dt, float(passes), *self.tolerances]
-        self._launch(self.solver, a_world * self.worlds, system + numbers, out, joint_space.BLOCK)
+        for kernel, lanes, block in self.solvers:
+            a_world = lanes if self.device.is_cuda else 1
+            self._launch(kernel, a_world * self.worlds, system + numbers, out, block)
 
     def find_system(self, q: wp.array, qd: wp.array, dt: float, **acting: wp.array | None) -> None:
         """Compute mass, poses, velocities, bias, surfaces, and what varies between worlds, of a state.
 
         ``acting``: body_f; ctrl, target_q and target_qd of motors.
         """
-        engine, sizes = self.dyn._engine, self.tables.sizes
+        engine, sizes, more = self.dyn._engine, self.tables.sizes, dict[str, wp.array]()
         engine.launch(MASS_MATRIX_PACKED, self.mass, q=q)
-        engine.launch(BODY_STATES, self.poses, {"velocities_out": self.velocities}, q=q, qd=qd)
-        more = {joint_system.SCREWS: self.screws}
+        states = {joint_system.VELOCITIES: self.velocities, joint_system.SCREWS: self.screws}
+        engine.launch_routine(STATES, self.poses, states, q=q, qd=qd)
         more |= {joint_system.SURFACES: self.surfaces} if sizes.surfaces else {}
         if self.names is not None:
             more |= {joint_system.OF_DOFS: self.dof_values, joint_system.OF_PAIRS: self.pair_values}
@@ -269,6 +286,9 @@ class JointSpaceStep:
             more |= {joint_system.OF_MOTORS: self.motors}
         else:
             acting = {name: array for name, array in acting.items() if name == "body_f"}
+        if not more:
+            engine.launch_routine(BIAS, self.bias, q=q, qd=qd, **acting)
+            return
         options: dict[str, Any] = dict(pairs=tuple(self.tables.pairs), motors=self.motor_laws, names=self.names)
         options["surfaces"] = bool(sizes.surfaces)
         engine.launch_routine(SYSTEM, self.bias, more, q=q, qd=qd, dt=dt, **acting, **options)

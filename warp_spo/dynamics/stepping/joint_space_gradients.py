@@ -130,7 +130,7 @@ class JointSpaceGradients:
         tau, target_q, target_qd = (given.get(name, other) for name, other in optional.items())
         read = [solver.mass, solver.bias, tau, given["q"], given["qd"], target_q, target_qd, solver.screws, solver.near]
         read += [solver.touches, solver.surfaces, solver.motors, solver.dof_values, solver.pair_values, solver.place]
-        size = -(-joint_adjoint.work_size(sizes, count) // 4) * 4
+        size = joint_adjoint.work_size(sizes, count)
         work = self._array("passes", count, (self.worlds, size))
         solved, gains = (self._array(name, count, (self.worlds, count * dofs)) for name in ("solved", "gains"))
         shapes = {"tau": tau, "q": given["q"], "qd": given["qd"], "target_q": target_q, "target_qd": target_qd}
@@ -140,10 +140,10 @@ class JointSpaceGradients:
         found |= {name: self._array("gradient", name, (self.worlds, self.dyn.scene.contact_count)) for name in VALUES}
         found[derivatives.POSES] = self._array("gradient", "poses", solver.poses.shape)
         names = "tau", "q", "qd", "target_q", "target_qd", "screws", "touches", "surfaces", "motors", *VALUES
-        threads = self.worlds * (joint_space.BLOCK if self.device.is_cuda else 1)
+        threads = self.worlds * (joint_space.WARP if self.device.is_cuda else 1)
         inputs = [self.worlds, *read, h, float(count), cotangent]
         outputs = [work, solved, gains, *(found[name] for name in names)]
-        launches.launch(self.kernel, threads, inputs, outputs, device=self.device, block_dim=joint_space.BLOCK)
+        launches.launch(self.kernel, threads, inputs, outputs, device=self.device, block_dim=joint_space.WARP)
         by_pass = [[self._array("of a pass", key, n, (self.worlds, dofs)) for n in range(count)] for key in (0, 1)]
         for whole, parts in zip((solved, gains), by_pass, strict=True):
             for number, part in enumerate(parts):

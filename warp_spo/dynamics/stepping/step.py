@@ -120,7 +120,7 @@ def _without_gradient(dyn: Dynamics, arguments: dict[str, Any]) -> str:
     return ""
 
 
-def _lacking(links: Links) -> str:
+def _find_what_lacks_gradients(links: Links) -> str:
     """Return what of a scene has no gradient, and the way out; "" if nothing."""
     way = "leave out contacts with other=, as those with the ground have gradients, or call inside torch.no_grad()"
     why = reason_against_gradients(links.scene, tuple(links.variable)) if links.scene.contact_pairs else ""
@@ -180,7 +180,7 @@ STEP = Operation(
         refuses=_without_gradient,
         adds=_solve_in_joint_space,
         repeats=_take_substeps,
-        lacking=_lacking,
+        lacking=_find_what_lacks_gradients,
     ),
 )
 
@@ -240,10 +240,11 @@ def _step(
         interval = StepArrays(given["q"], given["qd"], q_out, qd_out, given["dt"])
         given = {name: value for name, value in given.items() if name not in StepArrays._fields}
         status_array, found = given.get("status"), {"qdd": given.get("qdd"), **states, **reports}
-        if status_array is not None:
+        checked = status_array is not None and self._checks_results
+        if checked:
             interval = interval._replace(q=_apart(self, interval))
         _launch(self, call, integrator, substep_count, interval, given, buffers)
-        if status_array is not None:
+        if checked:
             found = {name.removeprefix("contact_"): array for name, array in found.items()}
             found = {"force" if name == "f" else name: array for name, array in found.items() if name != "moment"}
             reason = Status.LOOPS if self.closed and self.embedding is None else Status.RANGE

@@ -1,8 +1,8 @@
 """The guard between worlds and a learner: numbers that are not finite, or beyond their bounds, end a world.
 
 Each stage looks at what it makes: "act" at actions, "judge" at the state and at rewards, "observe" and "final" at
-observations. What others find they leave as a code in the array "found", and "judge" ends the world: in the same step,
-or in the next one for an observation, whose numbers are zero until then. It counts the first cause.
+observations. Other stages leave what they find as a code in the array "found", and "judge" ends the world: in the
+same step, or in the next one for an observation, whose numbers are zero until then. It counts the first cause.
 """
 
 from __future__ import annotations

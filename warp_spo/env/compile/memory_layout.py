@@ -23,17 +23,22 @@ LEFT_OUT: Any = object()
 
 
 OWN = re.compile(
-    r"action( [12])?|command( held)?|until command|until (event|values) \d+|history \d+|episodes|curriculum steps|"
+    r"action( [12])?|command( held)?|until command|until (event|values) \d+|(history|bias|delay) \d+|episodes|"
     r"last seconds|last end .*|(last |sum )reward .*|(last |sum |steps of |last steps of )metric .*|"
-    rf"{AGE}|{TAKEN}",
+    rf"curriculum steps|curriculum .* above \S+ (below \S+ )?by \S+|{AGE}|{TAKEN}",
     re.DOTALL,
 )
 """Names under which an environment itself remembers something."""
 
 
+def is_own(name: Any) -> bool:
+    """Return whether the environment itself remembers something under this name."""
+    return isinstance(name, str) and OWN.fullmatch(name) is not None
+
+
 def check_memory_name(call: str, name: Any) -> None:
     """Raise ValueError if a name of memory is one that the environment itself keeps; ``call`` is in the message."""
-    if isinstance(name, str) and OWN.fullmatch(name):
+    if is_own(name):
         raise ValueError(
             f"{call}: {shown(name)!r} is a name under which the environment itself remembers something; expected "
             "another one"

@@ -35,7 +35,7 @@ def numbers(what: str, values: Any, size: int | None = None) -> Vector:
     """
     found = vector(_number(what, values, x, size) for x in _flat(values))
     if size is not None and len(found) != size:
-        raise ValueError(f"Env: {what} {came(values)}; expected {_expected(size)}")
+        raise ValueError(f"Env: {what} {came(values)}; expected {_describe_expectation(size)}")
     return found
 
 
@@ -175,7 +175,7 @@ def _flat(values: Any) -> list[Any]:
     return [values]
 
 
-def _expected(size: int | None, kind: str = "") -> str:
+def _describe_expectation(size: int | None, kind: str = "") -> str:
     """Return what was expected in words, such as "2 finite numbers"."""
     return {None: f"{kind}numbers", 1: f"one {kind}number"}.get(size, f"{size} {kind}numbers")
 
@@ -191,4 +191,4 @@ def _number(what: str, values: Any, x: Any, size: int | None) -> Any:
         return float(x)
     held = came(x) if x is values else f"{came(values)} that holds {came(x)}"
     way_out = "; a term in torch is a TorchTerm" if hasattr(x, "detach") else ""
-    raise TypeError(f"Env: {what} {held}; expected {_expected(size, 'finite ' if plain else '')}{way_out}")
+    raise TypeError(f"Env: {what} {held}; expected {_describe_expectation(size, 'finite ' if plain else '')}{way_out}")

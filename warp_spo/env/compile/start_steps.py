@@ -1,6 +1,6 @@
 """Reports of the state in which worlds start anew that only a step can give: a step from there that leads nowhere.
 
-What follows from the state itself is traced into the stage that starts worlds, see :mod:`.starts`.
+Reports that follow from the state itself are traced into the stage that starts worlds, see :mod:`.starts`.
 """
 
 from __future__ import annotations

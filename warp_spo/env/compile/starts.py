@@ -10,16 +10,23 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import numpy as np
+
+from ...errors import quoted
+from ...recursions import kinematics
 from ...recursions.contact.law import slip_speed
 from ...recursions.contact.points import place_points
 from ...recursions.model.links import Links
 from ...recursions.model.tracing import Trace
 from ...recursions.step.actuation import actuator_force
 from ...recursions.step.joint_laws import JointLaws
+from ...scene.frames import check_frames, origins
+from ...trace.functions import AbstractScalar
 from ...trace.scalars import Graph, Value, less, select
-from ..world import World
+from ..drawn_values import POSES
+from ..world import Frame, World
 from .memory_layout import NET_TARGETS
-from .vectors import as_value
+from .vectors import as_value, vector
 
 MOVED = ("contact_gap", "contact_slip")  # reports that follow from the state
 CONTROLS = ("ctrl", "tau", "target_q")
@@ -57,6 +64,34 @@ def trace_of(w: World, controls: dict[str, dict[int, Any]]) -> Trace:
 
     links = Links(w.scene, w._layout.values, StateGraph(w._stage.graph, read))
     return Trace(links, "float32", ("q", "qd", *controls))
+
+
+class StartWorld(World):
+    """A world in a state to which no step has led: its frames are where q and qd put them when they are asked for."""
+
+    def frame(self, name: Any) -> Frame:
+        """Return a frame, as :meth:`World.frame`; ValueError where events change how joints are mounted."""
+        varying = [anchors for anchors in POSES if anchors in self._layout.values]
+        if varying:
+            raise ValueError(
+                f"World.frame: an event, a command, or an action whose force is observed reads {quoted(name)} where an "
+                f"episode starts; expected no event that changes {varying[0]}, with which its pose there is not known"
+            )
+        held = [self._layout.frames[self._layout.frame(name)]]
+        frames = check_frames(self.scene, "World.frame", held)
+        pose = vector(AbstractScalar(item.value) for item in kinematics.frame_poses(trace_of(self, {}), frames))
+        stores = kinematics.frame_velocities(trace_of(self, {}), origins(frames))
+        rates = vector(AbstractScalar(item.value) for item in stores)
+        return Frame(pose[:3], pose[3:], rates[:3], rates[3:])
+
+    def jacobian(self, name: Any) -> np.ndarray:
+        """Return a frame's Jacobian, as :meth:`World.jacobian`."""
+        held = [self._layout.frames[self._layout.frame(name)]]
+        frames = origins(check_frames(self.scene, "World.jacobian", held))
+        found = vector(0.0 for _ in range(6 * self.scene.dof_count)).reshape(6, -1)
+        for item in kinematics.jacobian(trace_of(self, {}), frames):
+            found[item.index[1:]] = AbstractScalar(item.value)
+        return found
 
 
 def contact_reports(w: World) -> dict[tuple[str, int], Value]:

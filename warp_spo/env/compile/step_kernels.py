@@ -18,6 +18,7 @@ from ...trace.functions import AbstractScalar, Condition, where
 from ...trace.scalars import branch, floor, ordered
 from ..bounds import term_causes
 from ..commands import COMMAND, HELD
+from ..curricula import metric_mean
 from ..events import EncoderBias, Interval, Reset, Start, Values
 from ..observations import Observation, name_of
 from ..world import World
@@ -25,7 +26,7 @@ from . import starts
 from .buffers import FAULT
 from .fused_kernel import FusedKernel
 from .guard import BEYOND, LARGEST, NOT_FINITE, Check, first, within
-from .memory_layout import MemoryLayout
+from .memory_layout import MemoryLayout, is_own
 from .returned import (
     check_event,
     check_force,
@@ -220,7 +221,7 @@ class Tracing:
                 w.keep_own(memory, w.memory(memory, 1) + where(counts, more, 0.0))
         found = {}
         for name in self.layout.metrics:
-            found[f"metric {name}"], _ = w.episode_mean("Env", name)
+            found[f"metric {name}"], _ = metric_mean(w, name)
             found[f"steps of metric {name}"] = w.kept[f"steps of metric {name}"][0]
         return found
 
@@ -231,10 +232,10 @@ class Tracing:
             The world after the stage: its state, its values, and what it keeps.
         """
         stage = w._stage
-        later = World(self.layout, stage)
+        later = starts.StartWorld(self.layout, stage)
         later.kept = w.kept
         self._draw_values(w, done, later, at_reset=True)
-        fresh = World(self.layout, stage)
+        fresh = starts.StartWorld(self.layout, stage)
         fresh.before, fresh.lasting = self.ended if intervals else None, True
         fresh.present = dict(later.present)
         fresh.__dict__["steps"] = 0.0
@@ -443,7 +444,7 @@ class Tracing:
 
     def _store_reports(self, w: World, done: Condition, later: World) -> None:
         """Store what observations read of a step, as it is in the state in which worlds start where ``done`` holds."""
-        start = World(self.layout, w._stage)
+        start = starts.StartWorld(self.layout, w._stage)
         start.__dict__.update(q=later.q, qd=later.qd, steps=0.0)
         start.present, start.kept = later.present, dict(w.kept)
         for name, (_, size, reset) in self.layout.memory.items():
@@ -480,7 +481,14 @@ class Tracing:
                 self._keep(w, name, kept[name])
 
     def _keep(self, w: World, name: str, values: Vector) -> None:
-        start = self.layout.memory[name][0]
+        """Store numbers of memory; not those of a term that no reset would clear, if they are not finite.
+
+        The world would end in each step from then on. What is kept at the start is stored, so that it is seen.
+        """
+        start, _, reset = self.layout.memory[name]
+        if reset is None and w._stage.name != "start" and not is_own(name):
+            fine = within(values, LARGEST)
+            values = vector(where(fine, new, old) for new, old in zip(values, w.stored_memory(name), strict=True))
         for i, value in enumerate(values):
             w._stage.store("memory", start + i, as_value(value))
 

@@ -18,18 +18,18 @@ LANES = np.arange(32)
 def shape_of(network: ActuatorNetwork) -> NetworkShape | None:
     """Return the shape of a network that tensor cores can evaluate as accurately as float32, None of others."""
     layers = network.layers
-    units = tuple(-(-len(biases) // 16) * 16 for _, biases in layers[:-1])
+    units = max((-(-len(biases) // 16) * 16 for _, biases in layers[:-1]), default=0)
     inputs = layers[0][0].shape[1]
-    if not units or network.activation not in BOUNDED or max(units) > MOST_UNITS or inputs > MOST_INPUTS:
+    if not units or network.activation not in BOUNDED or units > MOST_UNITS or inputs > MOST_INPUTS:
         return None
     scales = [1.0, *(SCALE * 2.0 ** _power(w) for w, _ in layers[1:-1])]
-    return NetworkShape(inputs, units, network.activation, tuple(scales))
+    return NetworkShape(inputs, units, len(layers) - 1, network.activation, tuple(scales))
 
 
 def pack(network: ActuatorNetwork, shape: NetworkShape) -> np.ndarray:
     """Return the array of weights, float32, some of whose words are two float16."""
-    found, before = [], -(-shape.inputs // 8) * 8
-    for layer, (units, scale) in enumerate(zip(shape.units, shape.scales, strict=True)):
+    found, before, units = [], shape.rows, shape.units
+    for layer, scale in enumerate(shape.scales):
         w, b = network.layers[layer]
         each = 1.0 if layer == 0 else scale / SCALE
         whole = np.zeros((before, units))

@@ -141,7 +141,7 @@ class _SegmentProgram:
         passes = self._make_pass_loop(traced, guesses)
         sent = self.sent + (2 * schedule.warps if guesses else 0)
         whole = [item for item in everything if item.array == "out"]
-        layout = self.builder.layout(job, whole, everything, sent, schedule.warps)
+        layout = self.builder.layout(job, whole, everything, sent, schedule.warps, helps=not guesses)
         if not self._fits(layout):
             return None
         kernel = WarpSpecializedKernel(schedule, self.dtype, passes)
@@ -238,7 +238,7 @@ class _SegmentProgram:
         kernel, layout, table, looks_up, _ = found
         routine, T = self.job.routine, self.run.dtype
         cpu = kernel.cpu()
-        cuda = kernel.cuda()  # fills the tables
+        cuda = kernel.cuda(("tau_row", layout.wait_for_helpers) if layout.helpers else None)  # fills the tables
         registers = self._registers(layout)
         if places := self.plan.spill_slots(
             routine, layout.shared_bytes(T), wp.types.type_size_in_bytes(T), layout.warps

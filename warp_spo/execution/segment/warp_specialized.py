@@ -173,8 +173,13 @@ class WarpSpecializedKernel:
         """Return the statements of a segment in braces."""
         return "\n".join(["{", render(listing, self.dtype, f"p{segment.index}_"), "}"])
 
-    def cuda(self) -> str:
-        """Return a branch for each structure of leaf segments, which the warps of these segments enter together."""
+    def cuda(self, awaited: tuple[str, str] | None = None) -> str:
+        """Return a branch for each structure of leaf segments, which the warps of these segments enter together.
+
+        Args:
+            awaited: a row that others write meanwhile, ``name_row``, and code that waits for it, not in passes until
+                guesses were right; each warp runs that code once, before it reads the row.
+        """
         kinds: dict[tuple, list[SegmentCode]] = {}
         for work in self._work.values():
             if not work.segment.children:
@@ -183,6 +188,8 @@ class WarpSpecializedKernel:
         for equal in kinds.values():
             text.append(f"{'else ' if text else ''}if ({any_of(_warps(equal))}) {{")
             inward, outward = self._shared_sweeps(equal)
+            if awaited:
+                inward = self._wait(inward, *awaited)
             text += [inward, self._inner(_warps(equal)), outward]
             if not self.passes and any(work.final_stores for works in kinds.values() for work in works):
                 text += [
@@ -191,7 +198,17 @@ class WarpSpecializedKernel:
                     self._final_stores(equal),
                 ]
             text.append("}")
-        return self._in_passes("\n".join(text)) if self.passes else "\n".join(text)
+        whole = self._in_passes("\n".join(text)) if self.passes else "\n".join(text)
+        if awaited and awaited[0] in whole.split(awaited[1])[0]:  # it is read before the sweeps of leaves
+            return "\n".join([awaited[1], whole.replace(awaited[1], ";")])
+        return whole
+
+    def _wait(self, inward: str, row: str, code: str) -> str:
+        """Return the inward sweep of leaves with code before the first line that reads a row, in the first pass."""
+        lines = inward.split("\n")
+        at = next((at for at, line in enumerate(lines) if row in line), len(lines))
+        first = "if (turn == 0) " if self.passes is not None and self.passes.counted else ""
+        return "\n".join([*lines[:at], first + code, *lines[at:]])
 
     def _in_passes(self, a_pass: str) -> str:
         """Return ``a_pass`` in a loop, then the final messages of every segment, then the final stores."""

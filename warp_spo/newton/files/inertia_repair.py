@@ -23,7 +23,7 @@ ROUNDING = 1.2e-7  # relative excess over the triangle inequality that counts as
 SMALL = 1e-3  # largest moment below which LEAST and ADDED shrink in proportion [kg m^2]: ADDED is 1/1000 of it
 
 
-def repaired(mass: float, inertia: np.ndarray) -> tuple[float, np.ndarray]:
+def repair_body(mass: float, inertia: np.ndarray) -> tuple[float, np.ndarray]:
     """Return a body's mass [kg] and inertia [kg m^2, 3 x 3], replaced if no rigid body can have them."""
     if not (np.isfinite(mass) and np.isfinite(inertia).all() and mass > 0.0):
         return 0.0, np.zeros((3, 3))
@@ -44,7 +44,7 @@ def repair_bodies(
 
     ``depth`` is the number of calls from the user's to this one; the warning names the user's line.
     """
-    values = [repaired(mass, inertia) for mass, inertia in zip(masses, inertias, strict=True)]
+    values = [repair_body(mass, inertia) for mass, inertia in zip(masses, inertias, strict=True)]
     replaced = [
         label
         for label, mass, inertia, (new_mass, new_inertia) in zip(labels, masses, inertias, values, strict=True)

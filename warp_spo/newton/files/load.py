@@ -59,9 +59,9 @@ def load(
 
     MJCF is compiled by MuJoCo, and becomes a scene as by :func:`from_mujoco`, in float64. A URDF is read in float64,
     and the scene has its numbers; order, labels and coordinates are those of Newton's model of the file. The unit of a
-    COLLADA mesh counts, its up axis does not. USD is read by Newton's importer, in float32. Visual shapes are skipped.
-    Collision shapes are read if ``contacts`` asks for them. A mesh file is needed only if a body that can move takes
-    its mass from it, or a contact its points.
+    COLLADA mesh counts; that y is up in it counts where the robot's joints bear it out, with a warning. USD is read by
+    Newton's importer, in float32. Visual shapes are skipped. Collision shapes are read if ``contacts`` asks for them.
+    A mesh file is needed only if a body that can move takes its mass from it, or a contact its points.
 
     Args:
         path: The robot file.

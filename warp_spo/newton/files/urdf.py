@@ -17,15 +17,16 @@ from typing import Any
 import numpy as np
 
 from ...errors import UnsupportedError, quoted
-from ...scene.collision_shapes import NONE, ShapeSelection
+from ...scene.collision_shapes import NONE, CollisionShape, ShapeSelection
 from ...scene.parts import UNLIMITED, Body, Hinge
 from ...scene.scene import Scene
 from ..worlds import quote_labels
 from .inertia_repair import repair_bodies
 from .urdf_masses import mass_of_shapes
 from .urdf_mimics import SCALAR, read_mimics
-from .urdf_shapes import urdf_pairs, urdf_shapes
+from .urdf_shapes import check_for_mass, urdf_pairs, urdf_shapes
 from .urdf_unknown import warn_of_unknown
+from .urdf_up_axis import turn_meshes
 from .xml_source import XmlElement, read_xml
 
 KINDS = {
@@ -78,7 +79,7 @@ def read_urdf(file: Path, floating: bool | None, repair: bool, selection: ShapeS
     couplings, held = read_mimics(carried)
     hinges = [base, *(_hinge(joint, number, label, held.get(index)) for index, joint in enumerate(carried))]
     _warn_of_limits(carried, held)
-    warn_of_unknown(file, [*carried, *links.values()])
+    warn_of_unknown(file, robot, [*carried, *links.values()])
     inertials = _inertials([links[link] for link in number], hinges, repair)
     masses, inertias = [i[0] for i in inertials], [i[2] for i in inertials]
     try:
@@ -93,8 +94,16 @@ def read_urdf(file: Path, floating: bool | None, repair: bool, selection: ShapeS
         raise ValueError(f"load: {str(file)!r}: {error}") from error
     ordered = [links[link] for link in number]
     call = f"load: {str(file)!r}"
-    shapes = functools.cache(lambda: urdf_shapes(robot, ordered, list(map(label, number)), _origin))
+    turned = list[str]()
+
+    @functools.cache
+    def shapes() -> list[CollisionShape]:
+        turned.append(turn_meshes(robot, origin_of))
+        return urdf_shapes(robot, ordered, list(map(label, number)), origin_of)
+
     scene, lost = selection.apply(call, scene, shapes, pairs=lambda: urdf_pairs(call, scene, shapes()))
+    if any(turned):
+        warnings.warn(f"{call}: {turned[0]}", UserWarning, stacklevel=3)
     if lost:
         warnings.warn(f"{call}: left out: {', '.join(lost)}", UserWarning, stacklevel=3)
     return scene
@@ -189,9 +198,9 @@ def _hinge(joint: XmlElement, number: dict[str, int], label: Callable[[str], str
         values["axis"] = _in_plane(axis) if kind == "planar" else axis
     if kind in SCALAR:
         values |= _limits(joint, kind)
-    position, turn = _origin(joint)
+    position, turn = origin_of(joint)
     if held is not None:
-        position, turn = _moved(position, turn, kind, _axis(joint), held)
+        position, turn = _move_child(position, turn, kind, _axis(joint), held)
         kind, values = "fixed", {}
     pose = np.concatenate([position, turn])
     try:
@@ -202,7 +211,7 @@ def _hinge(joint: XmlElement, number: dict[str, int], label: Callable[[str], str
         raise joint.error(str(error)) from error
 
 
-def _origin(holder: XmlElement) -> tuple[np.ndarray, np.ndarray]:
+def origin_of(holder: XmlElement) -> tuple[np.ndarray, np.ndarray]:
     """Return the position [m, 3] and the unit quaternion (xyzw) that an element's <origin> gives."""
     origin = holder.child("origin")
     if origin is None:
@@ -216,7 +225,7 @@ def _origin(holder: XmlElement) -> tuple[np.ndarray, np.ndarray]:
     return origin.numbers("xyz", 3, (0.0, 0.0, 0.0)), np.array(quaternion)
 
 
-def _moved(
+def _move_child(
     position: np.ndarray, turn: np.ndarray, kind: str, axis: np.ndarray, q: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the position and the unit quaternion of a joint's child where the joint's coordinate is ``q``."""
@@ -341,6 +350,8 @@ def _inertials(links: list[XmlElement], hinges: list[Hinge], repair: bool) -> li
         if not repair or weights[group[index]] != 0.0 or not shapes or link.find("inertial") is not None:
             continue
         if moves or link.find("collision//mesh") is None:
+            if moves:
+                check_for_mass(link)
             inertials[index] = mass_of_shapes(link)
             weighed += [link] * moves
     if weighed:
@@ -369,6 +380,6 @@ def _inertial(link: XmlElement) -> Inertial:
     mass, tensor = (part for part in parts if part is not None)
     xx, xy, xz, yy, yz, zz = (tensor.number(f"i{name}") for name in ("xx", "xy", "xz", "yy", "yz", "zz"))
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    com, turn = _origin(inertial)
+    com, turn = origin_of(inertial)
     rotation = _rotation(turn)
     return mass.number("value"), com, inertia if turn[3] == 1.0 else rotation @ inertia @ rotation.T

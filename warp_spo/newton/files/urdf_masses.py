@@ -33,6 +33,8 @@ def mass_of_shapes(link: XmlElement) -> tuple[float, np.ndarray, np.ndarray]:
             scale = unit_of(old, file) * old.numbers("scale", 3, (1.0, 1.0, 1.0))
             new.set("filename", str(file))
             new.set("scale", " ".join(map(repr, scale.tolist())))
+        for capsule in alone[-1].iter("capsule"):
+            capsule.set("height", capsule.get("height") or capsule.get("length", ""))  # Newton reads no length
     builder = newton.ModelBuilder()
     try:
         builder.add_urdf(ET.tostring(robot, encoding="unicode"))

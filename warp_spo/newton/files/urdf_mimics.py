@@ -15,7 +15,7 @@ SCALAR = ("revolute", "continuous", "prismatic")
 
 
 class Mimics(NamedTuple):
-    """What the mimics of a file say.
+    """The mimics of a file.
 
     Attributes:
         couplings: of joints that follow one that moves; hinge 0 is the base, hinge k + 1 that of joint k.

@@ -42,19 +42,42 @@ def urdf_shapes(
     for body, (link, label) in enumerate(zip(links, labels, strict=True)):
         elements: list[Any] = link.findall("collision")
         for number, collision in enumerate(elements):
-            geometry = collision.child("geometry")
-            if geometry is None:
-                raise collision.error("no <geometry>; expected one; write it")
+            shape = shape_of(collision)
             name = collision.get("name") or (label if len(elements) == 1 else f"{label}:{number}")
             pose = np.concatenate(origin(collision))
             frictions = _urdf_frictions(robot, link)
-            for shape in geometry:
-                if shape.tag in KINDS:
-                    kind, sizes, names = _urdf_sizes(shape)
-                    found.append(CollisionShape(name, body, kind, pose, sizes, names=names, **frictions))
-                else:
-                    found.append(CollisionShape(name, body, f"<{shape.tag}>", pose))
+            if shape.tag in KINDS:
+                kind, sizes, names = _urdf_sizes(shape)
+                found.append(CollisionShape(name, body, kind, pose, sizes, names=names, **frictions))
+            else:
+                found.append(CollisionShape(name, body, f"<{shape.tag}>", pose))
     return [dataclasses.replace(shape, index=index) for index, shape in enumerate(found)]
+
+
+def shape_of(collision: XmlElement) -> XmlElement:
+    """Return the one shape of a <collision>; ValueError that names the line if it has none or several."""
+    geometry = collision.child("geometry")
+    if geometry is None:
+        raise collision.error("no <geometry>; expected one; write it")
+    shapes: list[Any] = list(geometry)
+    if len(shapes) != 1:
+        words = ", ".join(f"<{shown(shape.tag)}>" for shape in shapes) or "nothing"
+        raise geometry.error(f"it holds {words}; expected one shape; write a <collision> for each")
+    return shapes[0]
+
+
+def check_for_mass(link: XmlElement) -> None:
+    """Raise ValueError that names the line unless all shapes of a link can give it a mass."""
+    collisions: list[Any] = link.findall("collision")
+    for collision in collisions:
+        shape = shape_of(collision)
+        if shape.tag not in KINDS:
+            known = ", ".join(f"<{tag}>" for tag in KINDS)
+            raise shape.error(
+                f"a shape that is not read; expected one of {known}, because its link has no mass; write <inertial>"
+            )
+        if SHAPES[KINDS[shape.tag]].sizes is not None:
+            _urdf_sizes(shape)
 
 
 def urdf_pairs(call: str, scene: Scene, shapes: list[CollisionShape]) -> PairSelection:

@@ -1,4 +1,4 @@
-"""Elements and attributes of a URDF's joints and links that URDF does not define, such as misspelt ones.
+"""Elements of a URDF, and attributes of its joints and links, that URDF does not define, such as misspelt ones.
 
 They are not read. Names of other programs for shapes, and hints that concern no motion, are left alone.
 """
@@ -14,6 +14,8 @@ from .xml_source import XmlElement
 
 JOINT = "name type origin parent child axis calibration dynamics limit mimic safety_controller dont_collapse"
 LINK = "name type inertial visual collision contact self_collision_checking collision_checking self_filter surface"
+ROBOT = "link joint material gazebo transmission sensor ros2_control mujoco"
+"""Elements of a robot that are read, or say nothing about its motion."""
 KNOWN = {
     "joint": JOINT,
     "link": LINK,
@@ -32,14 +34,21 @@ KNOWN = {
 MOST, NAMES = 10, 3  # that the warning shows: things, and joints or links with each
 
 
-def warn_of_unknown(file: Path, holders: Iterable[XmlElement]) -> None:
-    """Warn once of what joints and links hold that URDF does not define; ``holders`` are their elements."""
+def warn_of_unknown(file: Path, robot: XmlElement, holders: Iterable[XmlElement]) -> None:
+    """Warn once of what a robot, its joints and its links hold that URDF does not define.
+
+    ``holders`` are the elements of the joints and links.
+    """
     found: dict[str, list[str]] = {}
+    for element in robot:
+        if element.tag not in ROBOT.split():
+            named = [str(element.get("name"))] if element.get("name") else []
+            found.setdefault(f"<{shown(element.tag)}>", []).extend(named)
     for holder in holders:
         for words in dict.fromkeys(_unknown(holder)):
             found.setdefault(f"{words} of {holder.tag}s", []).append(str(holder.get("name")))
     if found:
-        parts = [f"{words} {_listed(names)}" for words, names in list(found.items())[:MOST]]
+        parts = [f"{words} {_list_some(names)}".rstrip() for words, names in list(found.items())[:MOST]]
         more = f", and {len(found) - MOST} more" if len(found) > MOST else ""
         warnings.warn(
             f"load: {str(file)!r}: left out, because URDF does not define it: {', '.join(parts)}{more}; correct the "
@@ -49,7 +58,7 @@ def warn_of_unknown(file: Path, holders: Iterable[XmlElement]) -> None:
         )
 
 
-def _listed(names: list[str]) -> str:
+def _list_some(names: list[str]) -> str:
     more = f" and {len(names) - NAMES} more" if len(names) > NAMES else ""
     return ", ".join(quoted(name) for name in names[:NAMES]) + more
 

@@ -23,7 +23,7 @@ from ..model_contacts import ModelShapes
 from ..pairs import select_pairs
 from ..worlds import WorldRows, quote_labels
 from .inertia_repair import repair_bodies
-from .usd_attributes import left_out
+from .usd_attributes import Imported, left_out
 from .usd_stage import check_nesting, check_size, check_values, prepare
 from .usd_values import (
     ImportedJoints,
@@ -85,15 +85,18 @@ def _read(
     """Return the scene of a file, and in words what it leaves out; arguments and errors as :func:`read_usd`."""
     from pxr import UsdGeom, UsdPhysics  # an ImportError names the extra
 
-    stage = _opened(file)
+    stage = _open_stage(file)
     metre, kilogram = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
     for name, unit in (("metersPerUnit", metre), ("kilogramsPerUnit", kilogram)):
         if not UNITS[0] <= unit <= UNITS[1]:
             raise ValueError(f"{call}: {name} is {unit}; expected a number between {UNITS[0]:g} and {UNITS[1]:g}")
+    if UsdGeom.GetStageUpAxis(stage) not in (UsdGeom.Tokens.y, UsdGeom.Tokens.z):
+        axis = shown(str(UsdGeom.GetStageUpAxis(stage)))
+        raise ValueError(f"{call}: upAxis is {axis!r}; expected Y or Z, as USD defines; turn the robot, and write one")
     check_values(call, stage)
     placed = joints_placed_on_world(stage)
     prepare(call, stage)
-    builder, found = _imported(stage, floating, metre**3 / kilogram)
+    builder, found = _import_stage(stage, floating, metre**3 / kilogram)
     if builder.body_count == 0:
         raise ValueError(f"{call} has no rigid bodies; expected prims with PhysicsRigidBodyAPI")
     joints = ImportedJoints(call, stage, builder, found["path_joint_map"])
@@ -109,11 +112,11 @@ def _read(
     stage.GetSessionLayer().Clear()  # from here on the stage says what the file says
     loops, labels = {loop.label for loop in scene.loops}, builder.joint_label
     of_loops = {path for path, joint in found["path_joint_map"].items() if labels[joint] in loops}
-    contacts = selection.contacts is not None
-    return scene, left_out(stage, of_loops, set(found["path_joint_map"]), found["physics_scene_path"], contacts)
+    made = Imported(of_loops, set(found["path_joint_map"]), set(found["path_shape_map"]), found["physics_scene_path"])
+    return scene, left_out(stage, made, selection.contacts is not None)
 
 
-def _opened(file: Path) -> Any:
+def _open_stage(file: Path) -> Any:
     """Return the stage of a file.
 
     Raises:
@@ -135,7 +138,7 @@ def _opened(file: Path) -> Any:
     return stage
 
 
-def _imported(stage: Any, floating: bool | None, density: float) -> tuple[newton.ModelBuilder, dict[str, Any]]:
+def _import_stage(stage: Any, floating: bool | None, density: float) -> tuple[newton.ModelBuilder, dict[str, Any]]:
     """Return what Newton's importer makes of a stage, and what it says of it.
 
     Args:
@@ -165,7 +168,7 @@ def _imported(stage: Any, floating: bool | None, density: float) -> tuple[newton
 
 
 def _refuse_lost_bodies(file: Path, stage: Any, builder: newton.ModelBuilder) -> None:
-    """Raise UnsupportedError if the importer left out a body, or made one that no joint carries."""
+    """Raise UnsupportedError if the importer left out a body, made one that no joint carries, or a kinematic one."""
     read = set(builder.body_label)
     lost = [path for path in _rigid_bodies(stage) if path not in read]
     if lost:
@@ -181,6 +184,17 @@ def _refuse_lost_bodies(file: Path, stage: Any, builder: newton.ModelBuilder) ->
             "load",
             f"{str(file)!r} with bodies that are body1 of no joint ({quote_labels(loose)})",
             "join each to the world by a joint without body0, or put an articulation root above them all",
+        )
+    driven = [
+        builder.body_label[child]
+        for child, kind in zip(builder.joint_child, builder.joint_type, strict=True)
+        if builder.body_flags[child] & int(newton.BodyFlags.KINEMATIC) and kind != newton.JointType.FIXED
+    ]
+    if driven:
+        raise UnsupportedError(
+            "load",
+            f"{str(file)!r} with kinematic bodies that no fixed joint holds ({quote_labels(driven)})",
+            "give each a PhysicsFixedJoint to the world, or write physics:kinematicEnabled = false",
         )
 
 

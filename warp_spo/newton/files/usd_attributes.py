@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from ...errors import shown
 from .usd_stage import AXES, all_prims, applied_schemas, is_physical, matches
@@ -49,7 +51,7 @@ def _axis(name: str, limited: bool) -> dict[str, Names]:
     return read | ({f"PhysicsLimitAPI:{name}": (f"limit:{name}:physics:*",)} if limited else {})
 
 
-def _joined(*parts: Mapping[str, Names]) -> dict[str, Names]:
+def _join_tables(*parts: Mapping[str, Names]) -> dict[str, Names]:
     """Return all names of several tables, by the schema that they need."""
     return {api: sum((part.get(api, ()) for part in parts), ()) for part in parts for api in part}
 
@@ -63,13 +65,13 @@ READ: dict[str, dict[str, Names]] = {
     },
     "shape": MASS | {"": ("physics:collisionEnabled", "newton:massModel", "newton:shellThickness", "mjc:shellinertia")},
     "material": {"": ("physics:density",)},
-    "PhysicsFixedJoint": _joined(JOINT, {"": ("physxJoint:*", "physics:axis", "physics:*Limit")}),
-    "PhysicsRevoluteJoint": _joined(JOINT, GEARS, {"": DOFS + LIMITS + SINGLE}, _axis("angular", False)),
-    "PhysicsPrismaticJoint": _joined(JOINT, GEARS, {"": DOFS + LIMITS + SINGLE}, _axis("linear", False)),
-    "PhysicsSphericalJoint": _joined(JOINT, {"": ("physics:axis", *DOFS)}),
-    "PhysicsJoint": _joined(JOINT, {"": DOFS + LIMITS}, *(_axis(name, True) for name in AXES)),
-    "PhysicsDistanceJoint": _joined(JOINT, {"": ("physics:minDistance", "physics:maxDistance")}),
-    "loop": _joined(JOINT, {"": ("physics:axis", "mjc:torqueScale")}),
+    "PhysicsFixedJoint": _join_tables(JOINT, {"": ("physxJoint:*", "physics:axis", "physics:*Limit")}),
+    "PhysicsRevoluteJoint": _join_tables(JOINT, GEARS, {"": DOFS + LIMITS + SINGLE}, _axis("angular", False)),
+    "PhysicsPrismaticJoint": _join_tables(JOINT, GEARS, {"": DOFS + LIMITS + SINGLE}, _axis("linear", False)),
+    "PhysicsSphericalJoint": _join_tables(JOINT, {"": ("physics:axis", *DOFS)}),
+    "PhysicsJoint": _join_tables(JOINT, {"": DOFS + LIMITS}, *(_axis(name, True) for name in AXES)),
+    "PhysicsDistanceJoint": _join_tables(JOINT, {"": ("physics:minDistance", "physics:maxDistance")}),
+    "loop": _join_tables(JOINT, {"": ("physics:axis", "mjc:torqueScale")}),
 }  # fmt: skip
 """Attributes that a scene takes up, as patterns: by the part of a prim and the applied schema that they need."""
 
@@ -132,32 +134,52 @@ NEUTRAL: dict[str, tuple[Any, ...]] = {
 PLACE: Names = ("xformOp*",)
 SHAPE: Names = ("size", "radius*", "height", "axis", "width", "length", "points", "faceVertex*", "orientation")
 """Attributes of geometry, of a prim with a body or a shape at or below it, and of a shape itself."""
+ROUND = ("Sphere", "Capsule", "Cylinder", "Cone")
+"""Shapes that no scale has in some directions: all for a sphere and a capsule, those across its axis for the others."""
+DISTORTION = 1e-4  # relative: of lengths and cosines of axes; files write them with six digits
 UNBOUNDED = 1e30
-"""What is above is without bound: files write the largest number of float32 for it."""
+"""Numbers above it are without bound: files write the largest number of float32 for it."""
 MOST = 100
 """Names of attributes in one warning."""
 
 
-def left_out(stage: Any, loops: set[str], joints: set[str], scene_path: str | None, contacts: bool) -> list[str]:
+class Imported(NamedTuple):
+    """Paths of what an importer made of a stage.
+
+    Attributes:
+        loops: of joints that became loops. joints: of all that became hinges or loops. shapes: of shapes.
+        scene: of the scene whose gravity counts, None without one.
+    """
+
+    loops: set[str]
+    joints: set[str]
+    shapes: set[str]
+    scene: str | None
+
+
+def left_out(stage: Any, made: Imported, contacts: bool) -> list[str]:
     """Return in words what a stage says of physics and a scene does not take up, each attribute with a prim.
 
     Args:
-        stage: as the file has it. loops: paths of joints that became loops. joints: of all that became hinges or
-            loops. scene_path: of the scene whose gravity counts. contacts: whether attributes of contact matter.
+        stage: as the file has it. made: what the importer made of it. contacts: whether attributes of contact matter.
     """
+    from pxr import UsdGeom
+
     found: dict[str, list[str]] = {}
+    poses = UsdGeom.XformCache()
     prims = list(all_prims(stage))
     places = {place for prim in prims if _has_place(prim) for place in prim.GetPath().GetPrefixes()}
     for prim in prims:
         path = str(prim.GetPath())
-        for what in _unread(prim, path, loops, joints, scene_path, contacts):
+        words = [*_unread(prim, path, made, contacts), *_unread_shape(prim, path, made), *_distortions(prim, poses)]
+        for what in words:
             found.setdefault(what, []).append(path)
         names = (PLACE if prim.GetPath() in places else ()) + (SHAPE if prim.HasAPI("PhysicsCollisionAPI") else ())
         for attribute in prim.GetAuthoredAttributes() if names else ():
             if matches(attribute.GetName(), names) and _changes(attribute):
                 found.setdefault(attribute.GetName(), []).append(path)
-    words = [f"{shown(what, 120)} ({_places(paths)})" for what, paths in found.items()]
-    return words[:MOST] + ([f"and {len(words) - MOST} more attributes"] if len(words) > MOST else [])
+    said = [f"{shown(what, 120)} ({_places(paths)})" for what, paths in found.items()]
+    return said[:MOST] + ([f"and {len(said) - MOST} more attributes"] if len(said) > MOST else [])
 
 
 def _has_place(prim: Any) -> bool:
@@ -170,9 +192,33 @@ def _places(paths: list[str]) -> str:
     return first if len(paths) == 1 else f"{first} and {len(paths) - 1} more"
 
 
-def _unread(
-    prim: Any, path: str, loops: set[str], joints: set[str], scene_path: str | None, contacts: bool
-) -> Iterator[str]:
+def _unread_shape(prim: Any, path: str, made: Imported) -> Iterator[str]:
+    """Yield in words that a prim is a collision shape which the importer did not make, such as one of another type."""
+    if prim.HasAPI("PhysicsCollisionAPI") and prim.GetAttribute("physics:collisionEnabled").Get() is not False:
+        if path not in made.shapes:
+            yield f"{prim.GetTypeName() or 'untyped'} prims as collision shapes"
+
+
+def _distortions(prim: Any, poses: Any) -> Iterator[str]:
+    """Yield in words where the pose of a body or a shape is none that it can have: a shear, a sphere that is none."""
+    if not _has_place(prim):
+        return
+    axes = np.array(poses.GetLocalToWorldTransform(prim))[:3, :3]
+    lengths = np.linalg.norm(axes, axis=1)
+    if not lengths.all():
+        return
+    cosines = axes @ axes.T / np.outer(lengths, lengths) - np.eye(3)
+    if np.abs(cosines).max() > DISTORTION:
+        yield "the shear of frames by a scale above a rotation"
+    kind = str(prim.GetTypeName())
+    if kind in ROUND and prim.HasAPI("PhysicsCollisionAPI"):
+        along = "XYZ".find(str(prim.GetAttribute("axis").Get())) if kind in ("Cylinder", "Cone") else -1
+        across = np.delete(lengths, along) if along >= 0 else lengths
+        if np.ptp(across) > DISTORTION * across.max():
+            yield f"a scale that differs between axes of a {kind}"
+
+
+def _unread(prim: Any, path: str, made: Imported, contacts: bool) -> Iterator[str]:
     """Yield what a scene does not take up of a prim: names of attributes, or of the prim's type."""
     from pxr import UsdPhysics
 
@@ -186,12 +232,12 @@ def _unread(
     if prim.IsA(UsdPhysics.Joint):
         if not prim.GetAttribute("physics:jointEnabled").Get():
             return
-        if path not in joints:
+        if path not in made.joints:
             yield "joints"
             return
     parts = [kind] if kind in READ else []
-    parts = ["loop"] if path in loops else parts
-    parts += ["scene"] if kind == "PhysicsScene" and path == scene_path else []
+    parts = ["loop"] if path in made.loops else parts
+    parts += ["scene"] if kind == "PhysicsScene" and path == made.scene else []
     parts += [
         part
         for part, schema in {"body": "RigidBodyAPI", "shape": "CollisionAPI", "material": "MaterialAPI"}.items()
@@ -224,10 +270,12 @@ def _has_gains(values: Mapping[str, Any], name: str) -> bool:
 
 
 def _changes(attribute: Any) -> bool:
-    """Return whether an attribute has values at times alone; no one value is that of a scene."""
+    """Return whether an attribute has values at times alone, or a spline; no one value is that of a scene."""
     from pxr import Usd
 
-    if hasattr(attribute, "GetTargets") or not attribute.GetNumTimeSamples():
+    if hasattr(attribute, "GetTargets"):
+        return False
+    if not attribute.GetNumTimeSamples() and not attribute.HasSpline():
         return False
     # Without a value of the file, Get returns the schema's.
     return bool(attribute.GetResolveInfo(Usd.TimeCode.Default()).GetSource() != Usd.ResolveInfoSourceDefault)

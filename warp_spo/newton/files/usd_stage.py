@@ -181,7 +181,9 @@ def prepare(call: str, stage: Any) -> None:
 
     Actuators of Newton, which may name files, are taken out, and bodies that are not enabled stand still. Free axes of
     a joint without a type get limits at infinity, because the importer locks an axis without a limit. A joint whose
-    ``body1`` is nearer to the root than ``body0`` gets them exchanged; its coordinates keep their sign.
+    ``body1`` is nearer to the root than ``body0`` gets them exchanged; its coordinates keep their sign. A blocked value
+    of a joint or a scene becomes the schema's own, where the importer takes any number. A shape gets the material that
+    is bound above it.
 
     Raises:
         UnsupportedError: A joint of several degrees of freedom is the wrong way round, or of a body that is not
@@ -189,6 +191,9 @@ def prepare(call: str, stage: Any) -> None:
     """
     from pxr import Usd, UsdPhysics
 
+    with Usd.EditContext(stage, stage.GetSessionLayer()):
+        _write_blocked_values(stage)
+        _bind_materials_to_shapes(stage)
     joints = [UsdPhysics.Joint(prim) for prim in all_prims(stage) if prim.IsA(UsdPhysics.Joint)]
     joints = [joint for joint in joints if joint.GetJointEnabledAttr().Get()]
     for joint in joints:
@@ -221,6 +226,47 @@ def prepare(call: str, stage: Any) -> None:
                 _free_axes_without_limits(call, joint.GetPrim())
         for joint in reversed_joints(stage, joints):
             _exchange_bodies(call, joint)
+
+
+def _write_blocked_values(stage: Any) -> None:
+    """Give each attribute of a joint or a scene whose value a file blocks the value that its schema has."""
+    from pxr import UsdPhysics
+
+    blocked = {
+        attribute.GetPath(): own
+        for prim in all_prims(stage)
+        if prim.IsA(UsdPhysics.Joint) or prim.IsA(UsdPhysics.Scene)
+        for attribute in prim.GetAuthoredAttributes()
+        if attribute.GetResolveInfo().ValueIsBlocked()
+        and (own := prim.GetPrimDefinition().GetAttributeFallbackValue(attribute.GetName())) is not None
+    }
+    for path, value in blocked.items():
+        _editable_prim(stage, path.GetPrimPath()).GetAttribute(path.name).Set(value)
+
+
+def _bind_materials_to_shapes(stage: Any) -> None:
+    """Bind to each shape itself the material of physics that is bound above it, or by a collection."""
+    from pxr import UsdPhysics, UsdShade
+
+    shapes = [prim for prim in all_prims(stage) if prim.HasAPI(UsdPhysics.CollisionAPI)]
+    materials, relations = UsdShade.MaterialBindingAPI.ComputeBoundMaterials(shapes, "physics")
+    bound = {
+        shape.GetPath(): material.GetPath()
+        for shape, material, relation in zip(shapes, materials, relations, strict=True)
+        if material and material.GetPrim().HasAPI(UsdPhysics.MaterialAPI) and relation.GetPrim() != shape
+    }
+    for path, material in bound.items():
+        binding = UsdShade.MaterialBindingAPI.Apply(_editable_prim(stage, path))
+        binding.Bind(UsdShade.Material.Get(stage, material), materialPurpose="physics")
+
+
+def _editable_prim(stage: Any, path: Any) -> Any:
+    """Return the prim of a path after the instances above it have prims of their own, in the layer that is edited."""
+    for prefix in path.GetPrefixes():
+        prim = stage.GetPrimAtPath(prefix)
+        if prim.IsInstance():
+            prim.SetInstanceable(False)
+    return stage.GetPrimAtPath(path)
 
 
 def _is_enabled(prim: Any) -> bool:
@@ -282,7 +328,7 @@ def reversed_joints(stage: Any, joints: list[Any]) -> list[Any]:
     for start in neighbors:
         if start in seen:
             continue
-        above = _reached(start, neighbors)
+        above = _find_reached(start, neighbors)
         seen |= set(above)
         if any(len({ends[joint] for joint in some}) > 1 for body in above for some in neighbors[body].values()):
             continue  # two joints between the same bodies are one if they lead the same way, a loop otherwise
@@ -296,7 +342,7 @@ def reversed_joints(stage: Any, joints: list[Any]) -> list[Any]:
                     down = sum(1 if ends[joint][0] == parent else -1 for joint in neighbors[body][parent])
                     upward[body] = upward[parent] + down
             roots = {min(upward, key=lambda body: (upward[body], not _is_root(stage, body)))}
-        above = _reached(roots.pop(), neighbors)
+        above = _find_reached(roots.pop(), neighbors)
         turned += [j for body, parent in above.items() if parent for j in neighbors[body][parent] if ends[j][0] == body]
     return turned
 
@@ -312,7 +358,7 @@ def is_equality(prim: Any) -> bool:
     return not {"MjcEqualityConnectAPI", "MjcEqualityWeldAPI"}.isdisjoint(applied_schemas(prim))
 
 
-def _reached(start: str, neighbors: dict[str, dict[str, list[Any]]]) -> dict[str, str | None]:
+def _find_reached(start: str, neighbors: dict[str, dict[str, list[Any]]]) -> dict[str, str | None]:
     """Return the bodies that joints reach from one, nearest first, each with the body before it."""
     found: dict[str, str | None] = {start: None}
     queue = deque([start])

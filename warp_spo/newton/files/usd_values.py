@@ -20,12 +20,12 @@ BY_DOF = (
     "joint_effort_limit", "joint_friction", "joint_armature", "joint_damping", "joint_stiffness", "joint_target_ke",
     "joint_target_kd", "joint_target_mode",
 )  # fmt: skip
-"""What a builder of Newton has for each dof."""
+"""Arrays of a builder of Newton with an entry for each dof."""
 ANCHOR_TOLERANCE = 1e-5  # of the places and the turns of joints that make up one; files write them in float32
 
 
 # -- attributes of MuJoCo and PhysX ------------------------------------------------------------------------------------
-def authored(prim: Any, name: str) -> Any:
+def read_authored(prim: Any, name: str) -> Any:
     """Return the value that a file writes for an attribute, None if it writes none."""
     attribute = prim.GetAttribute(name)
     return attribute.Get() if attribute and attribute.HasAuthoredValue() else None
@@ -33,25 +33,25 @@ def authored(prim: Any, name: str) -> Any:
 
 def _read(*names: str, getter: Any = None) -> SchemaResolver.SchemaAttribute:
     """Return an attribute for Newton's importer: the first of several that a file writes, unless a getter says it."""
-    found = lambda prim: next((value for name in names if (value := authored(prim, name)) is not None), None)  # noqa: E731
+    found = lambda prim: next((value for name in names if (value := read_authored(prim, name)) is not None), None)  # noqa: E731
     return SchemaResolver.SchemaAttribute(names[0], usd_value_getter=getter or found, attribute_names=names)
 
 
 def _effort_limit(prim: Any) -> float | None:
     """Return MuJoCo's bound of the forces of a joint's actuators [N, N m], if it is the same both ways."""
-    low, high = (float(authored(prim, f"mjc:actuatorfrcrange:{end}") or 0.0) for end in ("min", "max"))
-    limited = str(authored(prim, "mjc:actuatorfrclimited") or "auto")
+    low, high = (float(read_authored(prim, f"mjc:actuatorfrcrange:{end}") or 0.0) for end in ("min", "max"))
+    limited = str(read_authored(prim, "mjc:actuatorfrclimited") or "auto")
     return high if low == -high and (limited == "true" or (limited == "auto" and low < high)) else None
 
 
 def _soft_limit(axis: str, value: str) -> SchemaResolver.SchemaAttribute:
     """Return stiffness or damping of a limit of PhysX; without a stiffness the limit is hard, and none is read."""
     name, stiffness = f"physxLimit:{axis}:{value}", f"physxLimit:{axis}:stiffness"
-    return _read(name, getter=lambda prim: authored(prim, name) if authored(prim, stiffness) else None)
+    return _read(name, getter=lambda prim: read_authored(prim, name) if read_authored(prim, stiffness) else None)
 
 
 def _mass_model(prim: Any) -> str | None:
-    shell = authored(prim, "mjc:shellinertia")
+    shell = read_authored(prim, "mjc:shellinertia")
     return None if shell is None else "shell" if shell else "solid"
 
 
@@ -131,7 +131,7 @@ class ImportedJoints:
                 self.call, f"a joint that slides after one that turns, of {name!r} and the others between its bodies,",
                 "give each a body of its own",
             )  # fmt: skip
-        if any(authored(prim, "physics:excludeFromArticulation") for prim in group):
+        if any(read_authored(prim, "physics:excludeFromArticulation") for prim in group):
             raise UnsupportedError(
                 self.call,
                 f"joint {name!r} beside others between its bodies, of which one closes a loop,",
@@ -158,7 +158,7 @@ class ImportedJoints:
         return [
             dof
             for (path, axis), dof in self.dof_of.items()
-            if str(authored(self.stage.GetPrimAtPath(path), f"drive:{axis}:physics:type")) == "acceleration"
+            if str(read_authored(self.stage.GetPrimAtPath(path), f"drive:{axis}:physics:type")) == "acceleration"
         ]
 
     def turn_offsets_of_mimics(self) -> None:
@@ -246,7 +246,7 @@ def weights_held_up(stage: Any) -> dict[str, float]:
     for prim in all_prims(stage):
         if not prim.HasAPI("PhysicsRigidBodyAPI"):
             continue
-        off = 1.0 if authored(prim, "physxRigidBody:disableGravity") else authored(prim, "mjc:gravcomp")
+        off = 1.0 if read_authored(prim, "physxRigidBody:disableGravity") else read_authored(prim, "mjc:gravcomp")
         if off is not None:
             shares[str(prim.GetPath())] = float(off)
     return shares

@@ -34,7 +34,8 @@ def joints_placed_on_world(stage: Any) -> set[str]:
         for relation, position, rotation in sides:
             written = position.HasAuthoredValue() or rotation.HasAuthoredValue()
             if prim.IsA(UsdPhysics.FixedJoint):
-                written = any(position.Get()) or any(rotation.Get().imaginary)
+                values = [value for value in (position.Get(), rotation.Get()) if value is not None]  # None: blocked
+                written = any(any(getattr(value, "imaginary", value)) for value in values)
             said = written or relation.GetTargets() or joint.GetExcludeFromArticulationAttr().Get()
             if said and not body_of(stage, relation):
                 placed.add(str(prim.GetPath()))

@@ -1,7 +1,7 @@
 """Where shapes touch the grid of a height field: which points and lines a search finds, and where these lie.
 
 The search, :mod:`warp_spo.reference.field_grid`, is native code and finds discrete things: a grid point or a line from
-it, and a face or an edge. What follows from the pose and the heights is found here, with derivatives: on a face the
+it, and a face or an edge. Values that follow from pose and heights are found here, with derivatives: on a face the
 face's normal counts, at an edge, which crosses a line, the normal of both, and at the axis of a capsule the direction
 from the nearest point of the line to it.
 """
@@ -13,9 +13,10 @@ from typing import NamedTuple
 from ...scene.ground import AWAY, HeightField
 from ...scene.supports import CAPSULE_GRID, CYLINDER_GRID, GRIDS
 from ...trace.scalars import Graph, Scalar, Value, floor, inverse_root, is_constant, less, reciprocal, search, select
-from ...trace.spatial import Vector, dot, total
+from ...trace.spatial import Vector, dot
 from ..step.joint_laws import is_number
 from .ground import GROUND, Corners, GroundOffset, Surface, clamp, upward_normal
+from .supports import combine_axes
 
 QUADRANTS, ROW = 4, 9  # rows of a search, and numbers of a row
 NONE, POINT, INSIDE, VERTEX, LINE_Y, FACE = 0.5, 1.5, 2.5, 3.5, 4.5, 5.5
@@ -116,7 +117,7 @@ def _crossed_line(
 ) -> Value:
     """Return where in a cell, from its first line along y, an edge is farthest below it, as a share of the cell."""
     rate_x, rate_y = (1.0 / size for size in ground.cells)
-    along, seat = (_turned(shape.axes, local) for local in (found[:3], found[3:6]))
+    along, seat = (combine_axes(shape.axes, local) for local in (found[:3], found[3:6]))
     at = shape.centre + seat - corner
     x, y, s, t = along[0] * rate_x, along[1] * rate_y, at[0] * rate_x, at[1] * rate_y
     bend = 2.0 * cell.twist * (x * y)
@@ -154,7 +155,7 @@ def _under_face(
 
     ``vertex``: 1 where it is a corner of the shape on a line of ``cell`` through it.
     """
-    out, seat = (_turned(shape.axes, local) for local in (found[:3], found[3:6]))
+    out, seat = (combine_axes(shape.axes, local) for local in (found[:3], found[3:6]))
     below = corner - shape.centre - seat  # from the face or the edge to the grid point
     depth = -dot(out, below)
     under = below + out * depth
@@ -216,7 +217,3 @@ def _on_rim(
     normal = upward_normal((cell.run + cell.twist * t) * rate_x, (cell.rise + cell.twist * s) * rate_y)
     height = cell.base + cell.run * s + cell.rise * t + cell.twist * (s * t)
     return normal, (height - at[2]) * normal[2] + shape.radius, seat - normal * shape.radius
-
-
-def _turned(axes: list[Vector], local: list[Scalar]) -> Vector:
-    return Vector(total(x * axis[c] for x, axis in zip(local, axes, strict=True)) for c in range(3))

@@ -1,8 +1,9 @@
-"""Values of a state that the solver of touching bodies in joint space reads, beside mass matrix and body poses.
+"""Values of a state that the solver of touching bodies in joint space reads.
 
-These are the bias force, the surfaces of the ground at the points that may touch it, and what the laws of joints, pairs
-and points have in a world, of values that are variable or differ between worlds. A surface's point moves along a
-parabola, as :mod:`.points` explains; the push and the depth of its law say so.
+Beside the mass matrix these are poses and velocities of bodies, what dofs move, the bias force, the surfaces of the
+ground at the points that may touch it, and what the laws of joints, pairs and points have in a world, of values that
+are variable or differ between worlds. A surface's point moves along a parabola, as :mod:`.points` explains; the push
+and the depth of its law say so.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING
 from ...trace.emission import Store
 from ...trace.scalars import Value, is_constant, sqrt
 from ...trace.spatial import IDENTITY, ZERO, Vector, dot, total
-from ..kinematics import columns, zero
+from ..kinematics import body_poses, body_velocities, columns, zero
 from ..newton_euler import inverse_dynamics
 from ..step import descendants
 from ..step.actuation import build_joint_laws
@@ -24,6 +25,7 @@ from .points import place_points, with_ancestors
 if TYPE_CHECKING:
     from ..model.tracing import Trace
 
+VELOCITIES = "velocities"
 SCREWS, SURFACES, OF_MOTORS = "screws", "surfaces", "motors"
 OF_DOFS, OF_PAIRS = "dof_values", "pair_values"
 PASSED = "passed"  # array [world, dof]: qd + h qdd, as the last pass leaves it
@@ -48,6 +50,19 @@ OTHERS = (
 """Further values of the scene that laws read."""
 
 
+def joint_states(trace: Trace) -> list[Store]:
+    """out = poses of the bodies, VELOCITIES; SCREWS"""
+    stores = body_poses(trace)
+    stores += [item._replace(array=VELOCITIES) for item in body_velocities(trace)]
+    return stores + _screws(trace, _origins(trace))
+
+
+def joint_bias(trace: Trace) -> list[Store]:
+    """out = bias force, with gravity compensation"""
+    trace.compensate_gravity()
+    return list(inverse_dynamics(trace, qdd=zero))
+
+
 def joint_system(
     trace: Trace,
     surfaces: bool,
@@ -55,7 +70,7 @@ def joint_system(
     motors: tuple[int, ...],
     names: tuple[tuple[str, ...], tuple[str, ...]] | None = None,
 ) -> list[Store]:
-    """out = bias force, with gravity compensation; SCREWS; SURFACES; OF_MOTORS; OF_DOFS, OF_PAIRS that are no constants
+    """out = bias force, with gravity compensation; SURFACES; OF_MOTORS; OF_DOFS, OF_PAIRS that are no constants
 
     ``surfaces``: whether points may touch the ground. ``names``: of the values of dofs, and of pairs; None: all are
     constants. ``pairs``: the order of the scene's pairs, after which the surfaces follow. ``motors``: by dof, how many
@@ -65,13 +80,7 @@ def joint_system(
     laws = build_joint_laws(trace, trace.graph.input("dt", 0))
     stores = list(inverse_dynamics(trace, qdd=zero, letter="f"))
     place_axes_of(trace, list(trace.links.links))
-    origins: dict[int | None, Vector] = {None: ZERO}
-    for link in trace.active_links:
-        trace.label(link, "y")
-        own, over = trace.places[id(link)].pose.l, link.parent
-        origins[id(link)] = own if over is None else origins[id(over)] + trace.axes[id(over)] @ own
-    stores += _screws(trace, origins)
-    numbers = _add_surfaces(trace, laws, origins, stores) if surfaces else []
+    numbers = _add_surfaces(trace, laws, _origins(trace), stores) if surfaces else []
     stores += _motor_laws(trace, laws, motors)
     if names is not None:
         first = len(trace.links.scene.contact_points)
@@ -94,12 +103,22 @@ def state_after(trace: Trace) -> list[Store]:
     return stores
 
 
+def _origins(trace: Trace) -> dict[int | None, Vector]:
+    """Return where the frames of links that are placed lie, by id."""
+    origins: dict[int | None, Vector] = {None: ZERO}
+    for link in trace.active_links:
+        trace.label(link, "y")
+        own, over = trace.places[id(link)].pose.l, link.parent
+        origins[id(link)] = own if over is None else origins[id(over)] + trace.axes[id(over)] @ own
+    return origins
+
+
 def _screws(trace: Trace, origins: dict[int | None, Vector]) -> list[Store]:
     """Return the stores of the motion of each dof, of the links that carry bodies."""
     found: list[Store] = []
     carriers = with_ancestors([placement.link for placement in trace.links.placements.values()])
     for link in trace.active_links:
-        if id(link) not in carriers:
+        if id(link) not in carriers or not trace.exchange.own(link):
             continue
         trace.label(link, "j")
         parent = IDENTITY if link.parent is None else trace.axes[id(link.parent)]

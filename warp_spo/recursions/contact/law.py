@@ -58,7 +58,7 @@ class PointResult(NamedTuple):
 
 
 class PointReport(NamedTuple):
-    """What a pass finds of a point that a step may report: force on it, its slip, and the moment on its link there."""
+    """Results of a pass at a point that a step may report: force on it, its slip, and the moment on its link there."""
 
     point: TracedContactPoint
     force: Vector

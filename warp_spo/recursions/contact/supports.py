@@ -52,11 +52,12 @@ def hull_corners(graph: Graph, support: Support, axes: list[Vector], normal: Vec
 
 def place_corners(axes: list[Vector], found: Sequence[Value]) -> list[SupportPlacement]:
     """Return where the corners of a hull are whose places and presence a search ``found``, four numbers each."""
-    places = [_turned(axes, list(found[at : at + 3])) for at in range(0, len(found), 4)]
+    places = [combine_axes(axes, list(found[at : at + 3])) for at in range(0, len(found), 4)]
     return [SupportPlacement(place, place, _still, there) for place, there in zip(places, found[3::4], strict=True)]
 
 
-def _turned(axes: list[Vector], local: list[Value]) -> Vector:
+def combine_axes(axes: list[Vector], local: Sequence[Value]) -> Vector:
+    """Return the vector with the entries ``local`` along three axes."""
     return Vector(total(x * axis[c] for x, axis in zip(local, axes, strict=True)) for c in range(3))
 
 
@@ -78,7 +79,7 @@ def _corner(
         select(is_y, down[1], select(is_x, first, second)),
         select(is_z, down[2], second),
     ]
-    offset = _turned(axes, [sign * size for sign, size in zip(places, half, strict=True)])
+    offset = combine_axes(axes, [sign * size for sign, size in zip(places, half, strict=True)])
     return SupportPlacement(offset, offset, _still)
 
 
@@ -96,7 +97,7 @@ def _rim(
         cos, sin = SIDES[0], SIDES[1] if support.number == 2 else -SIDES[1]
         x, y = cos * x - sin * y, sin * x + cos * y
     radius = select(on_top, top, bottom)
-    hub, spoke = axes[2] * select(on_top, half, -half), _turned(axes, [radius * x, radius * y, 0.0])
+    hub, spoke = axes[2] * select(on_top, half, -half), combine_axes(axes, [radius * x, radius * y, 0.0])
 
     def bend(twist: Twist, change: Twist) -> Value:
         w = twist[0] - axes[2] * dot(axes[2], twist[0])
@@ -111,7 +112,7 @@ def _lowest(
 ) -> SupportPlacement:
     u = Vector(a * x for a, x in zip(half, n, strict=True))
     inverse = inverse_root(dot(u, u))
-    offset = _turned(axes, [-(a * (x * inverse)) for a, x in zip(half, u, strict=True)])
+    offset = combine_axes(axes, [-(a * (x * inverse)) for a, x in zip(half, u, strict=True)])
 
     def bend(twist: Twist, change: Twist) -> Value:
         moves = cross(normal, twist[0])

@@ -8,7 +8,6 @@ from ...trace.differentiation import reverse
 from ...trace.emission import Store
 from ...trace.scalars import ordered
 from ..contact import joint_system as system
-from ..kinematics import body_poses
 from .adjoints import gradient_stores
 from .power import Power
 
@@ -26,7 +25,8 @@ def joint_system_vjp(
     Their cotangents are "screws_bar" and so on. Options are those of :func:`..contact.joint_system.joint_system`.
     """
     results = [item for item in system.joint_system(trace, surfaces, pairs, motors) if item.array != "out"]
-    results += [Store(POSES, item.index, item.value) for item in body_poses(trace)]
+    states = [item for item in system.joint_states(trace) if item.array != system.VELOCITIES]
+    results += [item._replace(array=POSES) if item.array == "out" else item for item in states]
     return _pull_back(trace, results, {item.array: f"{item.array}_bar" for item in results}, wrt)
 
 
