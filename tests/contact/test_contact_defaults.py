@@ -40,13 +40,11 @@ def test_what_is_held(dt, device):
 def test_a_walker_is_not_lost_and_stands_as_in_mujoco(device):
     """The short form of ``benchmarks.contact.walkers``, whose robots come from packages, with a Go2 that ships here."""
     walker = walkers.read(robots.FILES / "go2.xml", "go2")
-    heights = []
     for way in walkers.WAYS:
         dyn = spo.Dynamics(walker.scenes[way], 16, device)
         for dt in (5e-3, 1e-2):
             assert all(one.value == 0.0 for one in walkers.thrown(walker, way, dt, dyn)), (way, dt)
         if way == "drives":
-            heights.append({one.name.partition(": ")[2]: one.value for one in walkers.at_rest(walker, 5e-3, 1.0, dyn)})
-    mujoco = {one.name.partition(": ")[2]: one.value for one in walkers.at_rest_in_mujoco(walker, 1.0, 2)}
-    assert heights[0]["stands, share"] == mujoco["stands, share"] == 1.0
-    assert abs(heights[0]["height, median [mm]"] - mujoco["height, median [mm]"]) < 5.0, (heights[0], mujoco)
+            ours = list(walkers.at_rest(walker, 5e-3, 1.0, dyn))
+    for found in (ours, list(walkers.at_rest_in_mujoco(walker, 1.0, 2))):
+        assert [one.value for one in found if one.name.endswith("stands, share")] == [1.0]
