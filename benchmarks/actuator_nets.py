@@ -38,7 +38,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "network": {},
     "kernels apart": {"JOINED_ON": ()},
     "products in float32": {"TENSOR_CORES": False},
-    "layers in a loop": {"LOOPS": True},
+    "layers in a loop": {"LAYERS_IN_A_LOOP": True},
     "a tile at a time": {"TILES": 1},
     "without helpers": {"MOST_TEAM": 0},
     "a reciprocal each": {"PAIRS": False},

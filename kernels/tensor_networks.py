@@ -21,7 +21,7 @@ MOST_INPUTS, MOST_UNITS = 16, 64
 BOUNDED = ("softsign", "tanh")
 PAIRS = True  # softsign takes one reciprocal for two sums
 TILES = 2  # of 16 rows side by side
-LOOPS = False  # code of hidden layers stands once; not timed yet
+LAYERS_IN_A_LOOP = False  # code of hidden layers stands once; not timed yet
 
 
 class NetworkShape(NamedTuple):
@@ -106,8 +106,8 @@ def define(name: str, shape: NetworkShape) -> str:
     """Return the definition of ``name::tiles(staged, weights, sums)``, which needs PRODUCTS.
 
     A warp calls it for TILES of 16 rows of inputs in shared memory, [input, PITCH]. Lane 4 g + t gets the sums of the
-    last layer of rows g, g + 8, and so on, side by side. With LOOPS code of hidden layers stands once: fetching it
-    takes as long as running it.
+    last layer of rows g, g + 8, and so on, side by side. With LAYERS_IN_A_LOOP code of hidden layers stands
+    once: fetching it takes as long as running it.
     """
     count, steps, hidden = shape.units // 8, shape.units // 16, shape.layers - 1
     first, between, last = shape.places
@@ -133,7 +133,7 @@ def define(name: str, shape: NetworkShape) -> str:
         "}",
         *_multiply("tf32", every, each, f"weights + {first}", count),
         "}",
-        f"#pragma unroll {1 if LOOPS else shape.layers}",
+        f"#pragma unroll {1 if LAYERS_IN_A_LOOP else shape.layers}",
         f"for (int layer = 0; layer < {shape.layers}; ++layer) {{",
         f"const float factor = {_by_layer(shape)};",
         every + each + "{",
