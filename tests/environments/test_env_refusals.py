@@ -6,7 +6,7 @@ import torch
 
 import warp_spo as spo
 from support.env_scenes import cart_env
-from warp_spo.env import Observation, TorchTerm, actions, commands, events, gymnasium, learning, recording
+from warp_spo.env import Observation, TorchTerm, actions, commands, events, gymnasium, learning, recording, validation
 from warp_spo.env.observations import Each
 from warp_spo.examples import fourbar
 
@@ -296,6 +296,20 @@ def test_tensors_that_are_written_require_no_grad():
         env.q[:] = 0.01 * asks(3, 2)
     env.values["joint_damping"] = asks(3, 2).detach()
     assert env.step(torch.zeros(3, 1))[0]["critic"].tolist() == [[2.0]] * 3
+
+
+@pytest.mark.parametrize(
+    ("bounds", "expected"),
+    [
+        ({}, ""),
+        (dict(least=0.5), ", 0.5 or more"),
+        (dict(most=2.0), ", 2 or less"),
+        (dict(least=0.5, most=2.0), ", 0.5 to 2"),
+    ],
+)
+def test_a_number_out_of_bounds_is_told_all_of_them(bounds, expected):
+    with pytest.raises(ValueError, match=f"^Call: x is nan; expected a finite number{expected}$"):
+        validation.check_number("Call", "x", NAN, **bounds)
 
 
 def test_values_that_are_written_are_numbers():

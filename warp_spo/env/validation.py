@@ -19,7 +19,9 @@ def check_number(call: str, name: str, value: Any, least: float = -math.inf, mos
     """Return a finite number; ValueError for anything else, or one below ``least`` or above ``most``."""
     found = _number(value)
     if found is None or not least <= found <= most:
-        more = "" if least == -math.inf else f", {least:g} or more" if most == math.inf else f", {least:g} to {most:g}"
+        more = f", {least:g} or more" if most == math.inf else f", {least:g} to {most:g}"
+        if least == -math.inf:
+            more = "" if most == math.inf else f", {most:g} or less"
         raise ValueError(f"{call}: {name} is {value!r}; expected a finite number{more}")
     return found
 
