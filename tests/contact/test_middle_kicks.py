@@ -9,7 +9,7 @@ from support import contact_cases, mechanisms, symbolic, warp_machine
 from support.contact_cases import quadruped, waisted
 from support.granularity_scenes import hand
 from support.step_scenes import furnished, states
-from warp_spo.dynamics.stepping import midpoint_contact
+from warp_spo.dynamics.stepping import midpoint_scheme
 from warp_spo.recursions.contact import step, velocity_kicks
 from warp_spo.recursions.contact.velocity_kicks import PASS_ACCELERATION, PATH, PREVIOUS_KICK, PREVIOUS_RATES
 from warp_spo.recursions.model.links import Links
@@ -238,14 +238,14 @@ def test_the_acceleration_is_that_of_the_whole_step(device):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("routine", [midpoint_contact.FIRST_KICK, midpoint_contact.FINAL_KICK], ids=["middle", "last"])
+@pytest.mark.parametrize("routine", [midpoint_scheme.FIRST_KICK, midpoint_scheme.FINAL_KICK], ids=["middle", "last"])
 @pytest.mark.parametrize("scene", [quadruped(contact_cases.EFFORT), waisted()], ids=["quadruped", "waisted"])
 def test_limbs_share_kicks(scene, routine, monkeypatch):
     """Code of a GPU, run by threads in both orders, finds what the whole tree finds."""
     rng, n, texts = np.random.default_rng(0), scene.dof_count, warp_machine.recorded(monkeypatch)
     given = flying(scene) | {name: 20.0 * rng.normal(size=(WORLDS, n)) for name in (PREVIOUS_RATES, PREVIOUS_KICK)}
     options, shapes = {}, {"out": (n,), "q_out": (scene.coord_count,), f"{PATH}_out": (n,)}
-    if routine is midpoint_contact.FINAL_KICK:
+    if routine is midpoint_scheme.FINAL_KICK:
         given, options = given | {PASS_ACCELERATION: rng.normal(size=(WORLDS, n))}, {"qdd": True}
         shapes = {"out": (n,), "qdd_out": (n,)}
     known = given | {"dt": np.full((WORLDS, 1), H)}

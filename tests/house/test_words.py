@@ -51,7 +51,7 @@ MODULES = {
     "given": "arguments", "groups": "shared_dofs", "helix": "helical", "impedance": "joint_laws",
     "kind": "hinge_type", "middle": "velocity_kicks", "neutral": "effective_mass", "pieces": "segments",
     "plugs": "mass_matrix_interface", "remembered": "scene_cache", "replays": "call_replay",
-    "rounds": "midpoint_contact", "samples": "trial_inputs", "saving": "checkpoint", "secants": "secant_laws",
+    "rounds": "midpoint_scheme", "samples": "trial_inputs", "saving": "checkpoint", "secants": "secant_laws",
     "sequences": "elementary", "set_aside": "register_spilling", "slide": "prismatic", "spin": "rotor_axis",
     "staged_rows": "shared_rows", "sticks": "segment_convex", "straight": "straight_line", "stretches": "path_blocks",
     "sums": "body_sums", "teams": "warp_specialized", "touches": "narrow_phase", "turn": "revolute",

@@ -8,7 +8,7 @@ import textwrap
 import numpy as np
 
 import warp_spo
-from warp_spo.dynamics.stepping.midpoint_contact import ITERATIONS
+from warp_spo.dynamics.stepping.midpoint_scheme import ITERATIONS
 from warp_spo.execution.routine import Routine
 from warp_spo.recursions import (
     composite,

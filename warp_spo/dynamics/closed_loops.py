@@ -51,7 +51,7 @@ def closure_error(self: Dynamics, q: ArrayT, out: ArrayT | None = None) -> Array
 
 PROJECT = Operation(
     "project",
-    arguments=(Q, QD, Option("hold", default=lambda scene: False), Option("iterations", asked=False)),
+    arguments=(Q, QD, Option("hold", default=lambda scene: False), Option("iterations", in_prepare=False)),
     results=(Result("q", "world, coordinate"), Result("qd", "world, dof")),
     embed=AS_WRITTEN,
     multipliers=AS_WRITTEN,

@@ -102,7 +102,7 @@ class Option:
         name: name of the argument.
         read: ``read(scene, call, value)`` returns what the routine gets; None: the method reads the value itself.
         default: ``default(scene)``, what ``prepare`` passes.
-        asked: it is an option of ``prepare``.
+        in_prepare: it is an option of ``prepare``, too.
         stand_in: ``stand_in(dyn, given)``, what ``prepare`` passes beside the arguments ``given``; None: the default.
         sample: ``sample(scene)``, what trials pass; None: nothing.
     """
@@ -110,7 +110,7 @@ class Option:
     name: str
     read: Callable[[Scene, Call, Any], Any] | None = None
     default: Callable[[Scene], Any] = lambda scene: None
-    asked: bool = True
+    in_prepare: bool = True
     sample: Callable[[Scene], Any] | None = None
     stand_in: Callable[[Any, dict[str, Any]], Any] | None = None
 
@@ -167,9 +167,9 @@ class Bundle:
                 raise ValueError(f"{call}: {self.name} names {name!r}; expected some of {known}")
         return dict.fromkeys(names, True)
 
-    def refuse(self, call: str, name: str, asked: bool = False) -> NoReturn:
-        """Raise TypeError for a member that is given by itself; ``asked``: to ``prepare``."""
-        form = f'{self.name}=("{name}",)' if asked and self.written else self.form.format(name=name)
+    def refuse(self, call: str, name: str, in_prepare: bool = False) -> NoReturn:
+        """Raise TypeError for a member that is given by itself; ``in_prepare``: to ``prepare``."""
+        form = f'{self.name}=("{name}",)' if in_prepare and self.written else self.form.format(name=name)
         raise TypeError(f"{call}: {name}= is no argument; expected {form}")
 
 
@@ -419,7 +419,7 @@ class Operation:
         Raises:
             TypeError: a member is given by itself. ValueError: a bundle has no such member.
         """
-        return self._replace(call, options, self.bundles, asked=True)
+        return self._replace(call, options, self.bundles, in_prepare=True)
 
     def as_given(self, names: Sequence[str]) -> list[str]:
         """Return names of arguments as callers know them: a bundle in place of its members."""
@@ -427,15 +427,15 @@ class Operation:
         return list(dict.fromkeys(homes.get(name, name) for name in names))
 
     def _replace(
-        self, call: str, options: dict[str, Any], bundles: tuple[Bundle, ...], asked: bool = False
+        self, call: str, options: dict[str, Any], bundles: tuple[Bundle, ...], in_prepare: bool = False
     ) -> dict[str, Any]:
         found = dict(options)
         for bundle in bundles:
             for name in options:
                 if name in bundle.members:
-                    bundle.refuse(call, name, asked)
+                    bundle.refuse(call, name, in_prepare)
             if bundle.name in options:
-                found.update((bundle.ask if asked else bundle.expand)(call, found.pop(bundle.name)))
+                found.update((bundle.ask if in_prepare else bundle.expand)(call, found.pop(bundle.name)))
         return found
 
     def run(self, dyn: Any, *args: Any, **more: Any) -> Any:

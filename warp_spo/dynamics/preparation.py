@@ -117,7 +117,7 @@ def _options(dyn: Dynamics, declared: tuple[Option, ...], options: dict[str, Any
     """Return the options that a method is called with, taken out of those that the caller passed to ``prepare``."""
     found: dict[str, Any] = {}
     for option in declared:
-        value = options.pop(option.name, None) if option.asked else None
+        value = options.pop(option.name, None) if option.in_prepare else None
         value = option.default(dyn.scene) if value is None else value
         if value is not None:
             found[option.name] = value

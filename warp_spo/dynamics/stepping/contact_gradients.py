@@ -32,7 +32,7 @@ from ...recursions.derivatives.contact_pass import (
 from ...recursions.model.messages import SIZES
 from ...recursions.model.tracing import Trace
 from ...scene.ground import HEIGHTS, HeightField
-from . import midpoint_contact, midpoint_contact_gradients
+from . import midpoint_scheme, midpoint_scheme_gradients
 
 if TYPE_CHECKING:
     from ..dynamics import Dynamics
@@ -87,8 +87,8 @@ def launch(
     pass_count = PASSES if passes is None else passes
     given = {name: value for name, value in given.items() if value is not None}
     results = dict(zip(wrt, (out, *more.values()), strict=True))
-    if rounds_made := midpoint_contact.count_rounds(dyn.scene, pass_count, rounds):
-        midpoint_contact_gradients.backpropagate(
+    if rounds_made := midpoint_scheme.count_rounds(dyn.scene, pass_count, rounds):
+        midpoint_scheme_gradients.backpropagate(
             dyn, functools.partial(_launch, dyn), results, pass_count, rounds_made, **given
         )
     else:

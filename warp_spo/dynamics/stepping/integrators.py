@@ -23,8 +23,8 @@ from ...runtime.arrays import Call
 from ...scene.scene import Scene
 from ..forward_dynamics import accelerations
 from ..kinematics import BODY_STATES
-from . import midpoint_contact
-from .midpoint_contact import CONTACT_STEP
+from . import midpoint_scheme
+from .midpoint_scheme import CONTACT_STEP
 
 if TYPE_CHECKING:
     from ..dynamics import Dynamics
@@ -111,12 +111,12 @@ def semi_implicit(
                 write_bodies(dyn, q_out, qd_out, bodies)
             return
         given |= {"passes": count, "reports": tuple(reports or ()), **option}
-        if made := midpoint_contact.count_rounds(dyn.scene, count, rounds):
-            midpoint_contact.step(dyn, dt, (q_out, qd_out), more | (reports or {}), q, qd, made, **given)
+        if made := midpoint_scheme.count_rounds(dyn.scene, count, rounds):
+            midpoint_scheme.step(dyn, dt, (q_out, qd_out), more | (reports or {}), q, qd, made, **given)
         else:
             launch(contact_routine(dyn), qd_out, more | (reports or {}), qd=qd, dt=dt, q=q, **given)
     elif rounds:
-        midpoint_contact.step(dyn, dt, (q_out, qd_out), more, q, qd, rounds, STEP, **given, **option)
+        midpoint_scheme.step(dyn, dt, (q_out, qd_out), more, q, qd, rounds, STEP, **given, **option)
     elif not dyn.closed:
         if bodies is not None and substeps == 1 and not _walks(dyn):
             further = more | {"poses_out": bodies[0], "velocities_out": bodies[1]}
@@ -178,7 +178,7 @@ def several_launches(
         return "loops='multipliers' takes several"
     if dyn.scene.contact_pairs:
         return "bodies that touch each other take one for each"
-    made = midpoint_contact.count_rounds(dyn.scene, passes, rounds) if passes is not None else rounds
+    made = midpoint_scheme.count_rounds(dyn.scene, passes, rounds) if passes is not None else rounds
     if made:
         asked = f"{passes} passes" if rounds is None else f"rounds={rounds}"
         return f"{asked} take{'s' if rounds else ''} iterations of the midpoint scheme"

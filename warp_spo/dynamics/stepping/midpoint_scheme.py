@@ -75,7 +75,7 @@ class MidpointIteration(NamedTuple):
     gained: wp.array
 
     def step(self, q: wp.array, path: bool = True) -> dict[str, wp.array]:
-        """Return what the step of the iteration reads for the coordinates ``q`` before the step, by name.
+        """Return the arrays that the step of the iteration reads for the coordinates ``q`` before the step, by name.
 
         ``path``: contacts read along which rates q moves.
         """
@@ -104,10 +104,13 @@ def step(
     routine: Routine = CONTACT_STEP,
     **given: Any,
 ) -> None:
-    """Launch a step of the midpoint scheme, of so many ``rounds``.
+    """Launch a step of the midpoint scheme, with contacts or without.
+
+    A kick is what velocity terms add to the rates in half a step. Each round is a kick and a step of ``routine``, which
+    has no velocity terms; the final kick follows the last round.
 
     Args:
-        routine: what a round makes between its kick and the next one.
+        rounds: how many, 1 or more. routine: CONTACT_STEP, or STEP in a scene without contacts.
         ends: arrays for q and qd after it. more: further arrays to fill, by name. given: arguments of the step, with
             its "passes", "reports" and options.
     """

@@ -11,7 +11,7 @@ from ...recursions.contact.velocity_kicks import KICK, PATH, START
 from ...runtime import launches
 from ..inertia import SOLVE_MASS_MATRIX
 from ..inverse_dynamics import PULLBACK
-from . import midpoint_contact
+from . import midpoint_scheme
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -37,10 +37,10 @@ def backpropagate(
             iterations. given: arguments of the step, and "qdd" that it found, which is found anew.
     """
     q, qd, dt, _ = (given.pop(name) for name in ("q", "qd", "dt", "qdd"))
-    iterations = midpoint_contact.run(
+    iterations = midpoint_scheme.run(
         dyn, dt, q, qd, rounds, given | {"passes": float(passes), "reports": ()}, {}, {}, gains=True
     )
-    end = midpoint_contact.begin_iteration(dyn, dt, q, qd, iterations)
+    end = midpoint_scheme.begin_iteration(dyn, dt, q, qd, iterations)
     for array in results.values():
         launches.fill(array, 0)
     adjoint, still = MidpointAdjoint(dyn, dt, q, qd, results), dyn.recursions.array(("way back", "still"), *q.shape)
@@ -91,7 +91,7 @@ class MidpointAdjoint:
         if name in self.results:
             self.combine(1.0, self.results[name], share, more, self.results[name])
 
-    def backpropagate_passes(self, one: midpoint_contact.MidpointIteration) -> None:
+    def backpropagate_passes(self, one: midpoint_scheme.MidpointIteration) -> None:
         """Add ``parts`` of an iteration's passes, and backpropagate its kick."""
         for name in self.results.keys() - {"q"}:
             self.add(name, self.parts[name])
@@ -101,7 +101,7 @@ class MidpointAdjoint:
 
     def backpropagate_kick(
         self,
-        one: midpoint_contact.MidpointIteration,
+        one: midpoint_scheme.MidpointIteration,
         by_kick: wp.array,
         by_half: wp.array | None = None,
         by_path: wp.array | None = None,
@@ -122,7 +122,7 @@ class MidpointAdjoint:
         self.combine(-1.0, by_u, 0.0, by_u, self.by_previous_kick)
         self.add("qd", by_v, 0.5)
 
-    def _terms(self, one: midpoint_contact.MidpointIteration, by_kick: wp.array) -> list[dict[str, wp.array]]:
+    def _terms(self, one: midpoint_scheme.MidpointIteration, by_kick: wp.array) -> list[dict[str, wp.array]]:
         """Return the gradients by what a kick is made of: along u + v, and along u - v.
 
         k = h acc / 2 with Mass acc + c(a) - c(b) = 0; of c(a) and c(b) gravity counts twice, and cancels.
@@ -151,7 +151,7 @@ class MidpointAdjoint:
         more = {f"{name}_bar": adjoint for name, adjoint in gradients.items() if name != "q"}
         state = {"q": self.q, "qd": rates, "dt": self.h, "cotangent": cotangent}
         self.dyn._engine.launch_routine(
-            midpoint_contact.INTEGRATE_VJP, gradients["q"], more, **state, wrt=tuple(gradients)
+            midpoint_scheme.INTEGRATE_VJP, gradients["q"], more, **state, wrt=tuple(gradients)
         )
         for name in gradients.keys() - {"qd"}:
             self.add(name, gradients[name])

@@ -42,7 +42,7 @@ from ..trial_inputs import rotations
 from . import contact_gradients, contact_options, integrators, joint_space_gradients
 from .integrators import INTEGRATORS, StepArrays
 from .joint_space import reason_against_gradients
-from .midpoint_contact import INTEGRATE_VJP
+from .midpoint_scheme import INTEGRATE_VJP
 from .options import OPTIONS, REPORT, REPORTS, StepOptions, StepReport, check_names
 
 MOST_FUSED = 1 << 10  # substeps in one kernel, so that it ends soon; drivers stop kernels that keep a display waiting
@@ -155,11 +155,11 @@ STEP = Operation(
         Option("integrator", default=lambda scene: "semi_implicit"),
         STATUS,
         CTRL,
-        Option("actuator_state", asked=False, stand_in=actuators.stand_in),
+        Option("actuator_state", in_prepare=False, stand_in=actuators.stand_in),
         Option("substeps", default=lambda scene: 1),
         Option("passes", default=lambda scene: None),
         Option("rounds", default=lambda scene: None),
-        Option("joint_space", default=lambda scene: None, asked=False),
+        Option("joint_space", default=lambda scene: None, in_prepare=False),
         *REPORTS,
     ),
     bundles=(OPTIONS, REPORT),
