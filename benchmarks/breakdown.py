@@ -124,7 +124,7 @@ class Case:
         """Return registers and stack of the programs."""
         if not self.dyn.device.is_cuda:
             return ""
-        found = [(key[0].name, one) for key, one in self.dyn.programs._programs.items() if one is not None]
+        found = [(key.routine.name, one) for key, one in self.dyn.programs._programs.items() if one is not None]
         rows = [(name, wp.get_cuda_kernel_properties(one.kernel, self.dyn.device, one.block)) for name, one in found]
         return ", ".join(f"{name} {row['register_count']}r {row['local_memory_size']}B" for name, row in rows)
 

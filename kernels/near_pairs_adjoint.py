@@ -141,7 +141,7 @@ to[6] = -2 * (f[3] * t[0] + f[4] * t[1] + f[5] * t[2]);
 
 
 @functools.cache
-def narrow_back(pairs: int, near: int, routines: tuple[str, ...]) -> wp.Kernel:
+def narrow_phase_back(pairs: int, near: int, routines: tuple[str, ...]) -> wp.Kernel:
     """Write the gradients by the motion of both bodies of each near pair; threads and arrays of :func:`.narrow`.
 
     ``touches_bar`` is laid out as ``touches``. ``wrenches`` [world, near pair * 12]: force, and moment about the origin
@@ -154,17 +154,17 @@ def narrow_back(pairs: int, near: int, routines: tuple[str, ...]) -> wp.Kernel:
 
 
 @functools.cache
-def add_wrenches(pairs: int, near: int) -> wp.Kernel:
-    """Add up the gradients by the motion of each body as one by its pose; a thread a body."""
+def poses_back(pairs: int, near: int) -> wp.Kernel:
+    """Write the gradient by the pose of each body, from the sum of the wrenches of its near pairs; a thread a body."""
     arrays = [("poses", 3), ("place", 1), ("near", 1), ("wrenches", 2), ("poses_bar", 3)]
     return native.kernel("wrenches_of_pairs", text_of(SUMS, pairs, near, wp.float64), arrays, wp.float64)
 
 
 @functools.cache
-def widen(T, to) -> wp.Kernel:
+def convert(T, to) -> wp.Kernel:
     """Copy numbers of one scalar type to an array of another; both are flat."""
 
-    @wp.kernel(module=f"warp_spo_widen_{T.__name__}_{to.__name__}", enable_backward=False)
+    @wp.kernel(module=f"warp_spo_convert_{T.__name__}_{to.__name__}", enable_backward=False)
     def kernel(x: wp.array[T], out: wp.array[to]):
         i = wp.tid()
         out[i] = to(x[i])

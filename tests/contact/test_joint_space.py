@@ -18,7 +18,7 @@ from support.pair_steps import StepAtPoints, points_of
 from warp_spo.dynamics.stepping import joint_space as choice
 from warp_spo.dynamics.stepping.joint_space import JointSpaceStep
 from warp_spo.examples import grasp
-from warp_spo.execution.joint_tables import lacking
+from warp_spo.execution.joint_tables import find_obstacle
 from warp_spo.kernels import joint_space
 from warp_spo.recursions.contact import joint_system
 
@@ -409,14 +409,14 @@ REFUSED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("lacks", REFUSED)
-def test_pairs_that_no_step_takes_are_refused_with_a_way_out(lacks):
-    make, way = REFUSED[lacks]
+@pytest.mark.parametrize("obstacle", REFUSED)
+def test_pairs_that_no_step_takes_are_refused_with_a_way_out(obstacle):
+    make, way = REFUSED[obstacle]
     scene = make()
     dyn, q = spo.Dynamics(scene, 2, "cpu"), np.tile(scene.neutral_q, (2, 1))
-    assert f"no step takes pairs of bodies beside {lacks}" in dyn.explain()
+    assert f"no step takes pairs of bodies beside {obstacle}" in dyn.explain()
     with pytest.raises(
-        spo.UnsupportedError, match=f"contact between bodies in a scene with {lacks} .*; {way}.*; or list few"
+        spo.UnsupportedError, match=f"contact between bodies in a scene with {obstacle} .*; {way}.*; or list few"
     ):
         dyn.step(q, np.zeros((2, scene.dof_count)), dt=H)
 
@@ -424,8 +424,8 @@ def test_pairs_that_no_step_takes_are_refused_with_a_way_out(lacks):
 def test_what_it_does_not_take_has_words():
     """And such scenes keep generated code."""
     scene = grasp.scene()
-    assert lacking(scene, ("joint_X_p", "contact_friction")) == ""
+    assert find_obstacle(scene, ("joint_X_p", "contact_friction")) == ""
     flat = scene.with_contacts([spo.Contact(0, box=(0.1, 0.1, 0.0), other=box(1, 0.1))])
-    assert lacking(flat, ()) == "boxes without thickness"
+    assert find_obstacle(flat, ()) == "boxes without thickness"
     turns = scene.with_contacts([spo.Contact(0, sphere=0.1, torsional_friction=0.1), *scene.contacts[1:]])
-    assert lacking(turns, ()) == "torsional friction" and lacking(shelf(-1), ()) == ""
+    assert find_obstacle(turns, ()) == "torsional friction" and find_obstacle(shelf(-1), ()) == ""

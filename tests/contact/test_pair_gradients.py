@@ -136,7 +136,7 @@ def test_planted_bugs(bug, monkeypatch):
     else:
         assert old in text
         planted = text.replace(old, new)
-    made = joint_adjoint.adjoint, near_pairs_adjoint.narrow_back, near_pairs_adjoint.add_wrenches
+    made = joint_adjoint.adjoint, near_pairs_adjoint.narrow_phase_back, near_pairs_adjoint.poses_back
     monkeypatch.setattr(file, name, planted)
     for one in made:
         one.cache_clear()

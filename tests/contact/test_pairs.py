@@ -138,9 +138,9 @@ BUGS = {
     "a pair of two is forgotten": (couples, FIND, FIND.replace("= find", "= e > first_pair_of(p) ? 0 : find")),
     "dampers before the step are forgotten": (couples, "FUSED(-K[e], start[(j + 3) % 6], load[i])", "load[i]"),
     "unequal forces": (coupled.CoupledStep._columns, "(1.0, -1.0)", "(1.0, -0.9)"),
-    "no other dof": (aggregates.Node._system, "if other <= at:", "if other == at:"),
-    "the base has no part": (aggregates.Node.close, "P.less(U[at], G[-1])", "P"),
-    "the base stands still": (aggregates.Node.open, "x - dot(self.G[-1 - at], alpha) if self.G else x", "x"),
+    "no other dof": (aggregates.AggregateSolve._system, "if other <= at:", "if other == at:"),
+    "the base has no part": (aggregates.AggregateSolve.close, "P.less(U[at], G[-1])", "P"),
+    "the base stands still": (aggregates.AggregateSolve.open, "x - dot(self.G[-1 - at], alpha) if self.G else x", "x"),
 }
 
 

@@ -112,7 +112,7 @@ RULES = {
     "quotient": lambda x, y: g.quotient(x * y, x + 3.0 * y),
     "reduced": lambda x, y: g.cos(g.reduced(x)) * y,
     "absolute": lambda x, y: g.absolute(x * y),
-    "guarded": lambda x, y: g.guarded(x * x + 2.0, y * y) * y,
+    "nan_unless_above": lambda x, y: g.nan_unless_above(x * x + 2.0, y * y) * y,
     "lost": lambda x, y: x.graph.make("lost", x) + x * y,
     "select": lambda x, y: g.select(x, x * y, y) + g.select(x.graph.make("lost", x), x, y * y),
     "less": lambda x, y: g.less(x, y) + x * y,

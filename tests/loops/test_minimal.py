@@ -273,8 +273,8 @@ BUGS = [
     ),
     ("log_det_mass_matrix", "log_det_mass_matrix", ", allowed=allowed)", ")"),
     ("jacobian", "_times_columns", "if dof in row)", "if dof in row and dof == free)"),
-    ("jacobian_bias", "demand", "cluster, loops.embedding.dofs", "cluster"),
-    ("centroidal_momentum_bias", "centroidal_momentum_bias", "trace, demand(loops).__getitem__", "trace"),
+    ("jacobian_bias", "loop_accelerations", "cluster, loops.embedding.dofs", "cluster"),
+    ("centroidal_momentum_bias", "centroidal_momentum_bias", "trace, loop_accelerations(loops).__getitem__", "trace"),
 ]
 
 

@@ -196,8 +196,8 @@ def explain(dyn: Dynamics) -> str:
     actuators = dyn.scene.actuators
     if not actuators:
         return "none"
-    dofs = {hinge for actuator in actuators for hinge in actuator.hinges}
+    hinges = {hinge for actuator in actuators for hinge in actuator.hinges}
     set_later = "actuator_delay" in dyn.variable
     longest = "as many steps as Dynamics.set says" if set_later else f"up to {most_delay(dyn)} steps"
     late = f"delays of {longest}, in a launch before each step" if delays_controls(dyn) else "no delays"
-    return f"{len(actuators)} on {len(dofs)} hinges, in the kernel of a step that is given ctrl; {late}"
+    return f"{len(actuators)} on {len(hinges)} hinges, in the kernel of a step that is given ctrl; {late}"

@@ -123,6 +123,10 @@ class SpatialOperators(LetterOwner):
             set_kind(owner, self._kind)
 
     def fill(self) -> None:
+        """Launch the blocks at the q of the last :meth:`update`, unless they are up to date.
+
+        Kernels of whole expressions compute at once, and do without blocks.
+        """
         capturing, stamp = self._recursions.device.is_capturing, self._recursions.parameters.version
         if self._fused and (stamp is None or self._filled != stamp or self._captured or capturing):
             self._filled = None if capturing else stamp
@@ -289,6 +293,7 @@ class SimilarOperators(LetterOwner):
         source._similar.add(self)
 
     def fill(self) -> None:
+        """Launch the blocks of the source and the factors of these operators, unless they are up to date."""
         source = self._source
         capturing = source.H.device.is_capturing
         with source._recursions.call_order.lock:

@@ -145,6 +145,7 @@ class CapturedPPO(PPO):
         return self.transition.actions  # type: ignore[return-value]
 
     def _act_for_graph(self) -> None:
+        """Act on ``_acted_on`` and wait for the values; keep the tensors that replays of the graph fill anew."""
         self._act(self._acted_on)
         assert self._values is not None
         self.transition.values = self._values()

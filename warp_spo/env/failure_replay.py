@@ -174,7 +174,7 @@ def read(file: str | Path) -> Failure:
     """Return what a file of ``Env(keep_failures=...)`` holds; nothing of it is executed.
 
     Raises:
-        OSError: there is no such file. ValueError: it is none of a failure, or of a later version.
+        OSError: there is no such file. ValueError: it is none of a failure, or of another format.
     """
     name = f"failure {str(file)!r}"
     data = Path(file).read_bytes()

@@ -123,7 +123,7 @@ def make_vector(env: Env, tensors: bool = False, autoreset_mode: Any = "SameStep
 
 
 def _by_world(log: dict[str, torch.Tensor], worlds: int, tensors: bool) -> dict[str, Any]:
-    """Return a log of all worlds as Gymnasium has information: an array [world] by name."""
+    """Return a log, one number for all worlds, as Gymnasium's information: arrays [world] of equal numbers."""
     if tensors:
         return {name: value.repeat(worlds) for name, value in log.items()}
     values = torch.stack([*log.values()]).cpu().numpy()

@@ -36,8 +36,8 @@ class Sphere:
 
     def distance(self, origin: Any, direction: Any, most: float) -> Any:
         """Return the distance along a ray of unit direction, ``most`` where it misses; 0 from inside."""
-        to = vector(origin) - np.array(self.center)
-        return _to_sphere(to, direction, self.radius, most)
+        from_center = vector(origin) - np.array(self.center)
+        return _to_sphere(from_center, direction, self.radius, most)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,8 +165,12 @@ def lidar(
     return Each(distance, directions)
 
 
-def _to_sphere(to: Any, direction: Any, radius: float, most: float) -> Any:
-    B, C = dot(to, direction), dot(to, to) - radius * radius
+def _to_sphere(from_center: Any, direction: Any, radius: float, most: float) -> Any:
+    """Return the distance along a ray of unit direction to a sphere, ``most`` where it misses; 0 from inside.
+
+    ``from_center``: where the ray starts, from the centre of the sphere [m].
+    """
+    B, C = dot(from_center, direction), dot(from_center, from_center) - radius * radius
     square = B * B - C
     t = -B - np.sqrt(where(square > 0.0, square, 0.0))
     return where(C < 0.0, 0.0, where((square > 0.0) & (t > 0.0) & (t < most), t, most))

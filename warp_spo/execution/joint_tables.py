@@ -91,33 +91,33 @@ def joint_tables(
     return JointTables(sizes, place, np.ravel(dof_values), _pair_values(scene, pairs, numbers), pairs)
 
 
-def lacking(scene: Scene, variable: tuple[str, ...]) -> str:
-    """Return what of a scene the solver in joint space does not take, in words; "" if nothing."""
+def find_obstacle(scene: Scene, variable: tuple[str, ...]) -> str:
+    """Return in words what a scene has that the solver in joint space does not take; "" if nothing."""
     some: bool | np.bool
-    lacks = ["bodies with modes"] * any(body.modes is not None for body in scene.bodies)
-    lacks += ["dofs without inertia"] * (not (neutral_inertias(scene) > 0.0).all())
+    found = ["bodies with modes"] * any(body.modes is not None for body in scene.bodies)
+    found += ["dofs without inertia"] * (not (neutral_inertias(scene) > 0.0).all())
     count = len(scene.contact_points)
     for name in TURNING_VALUES:
         some = name in variable or scene.values[name][:, :count].any()
-        lacks += [name.removeprefix("contact_").replace("_", " ")] * bool(count and some)
-    lacks += ["boxes without thickness"] * any(
+        found += [name.removeprefix("contact_").replace("_", " ")] * bool(count and some)
+    found += ["boxes without thickness"] * any(
         shape.has_faces and not (shape.size > 0.0).all() for pair in scene.contact_pairs for shape in pair.shapes
     )
-    if not lacks and len(_order(scene, _dofs_by_body(scene), _ways(scene))) > MOST_PLACES:
-        lacks.append(f"{scene.dof_count} dofs")
-    return lacks[0] if lacks else ""
+    if not found and len(_order(scene, _dofs_by_body(scene), _ways(scene))) > MOST_PLACES:
+        found.append(f"{scene.dof_count} dofs")
+    return found[0] if found else ""
 
 
 def why_unsolved(scene: Scene) -> str:
     """Return why no step takes the pairs of a scene; "" if one does, by generated code for few or in joint space."""
-    lacks = lacking(scene, ())
-    if not lacks or coupled.is_supported(Links(scene)):
+    obstacle = find_obstacle(scene, ())
+    if not obstacle or coupled.is_supported(Links(scene)):
         return ""
-    return f"steps of a scene with {lacks} do not solve such pairs in joint space"
+    return f"steps of a scene with {obstacle} do not solve such pairs in joint space"
 
 
-def way_out(lacks: str) -> str:
-    """Return what a user may do about pairs in a scene that lacks something, see :func:`lacking`."""
+def way_out(obstacle: str) -> str:
+    """Return what a user may do about pairs in a scene with an ``obstacle``, see :func:`find_obstacle`."""
     ways = {
         "bodies with modes": "leave out modes= of its bodies",
         "dofs without inertia": "give their bodies mass, or their hinges armature=",
@@ -125,7 +125,7 @@ def way_out(lacks: str) -> str:
         **{name.removeprefix("contact_").replace("_", " "): f"set {name} to zero, and leave it out of variable="
            for name in TURNING_VALUES},
     }  # fmt: skip
-    way = ways.get(lacks, "use another solver, such as Newton's SolverMuJoCo")
+    way = ways.get(obstacle, "use another solver, such as Newton's SolverMuJoCo")
     return f"{way}; or list few pairs of capsules, boxes and hulls, which need no joint space"
 
 

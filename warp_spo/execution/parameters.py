@@ -187,7 +187,7 @@ class Parameters:
 
     @property
     def ground_heights(self) -> wp.array:
-        """Heights of the ground's height field, rounded, row after row, field after field [height]."""
+        """Heights of all of the ground's fields in the dtype of kernels, row after row, field after field [height]."""
 
         def build() -> DerivedArrays:
             value = self._values[HEIGHTS]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -20,6 +20,21 @@ from .segment import programs as segment_programs
 from .segment.programs import BODIES
 
 
+class ProgramKey(NamedTuple):
+    """Everything by which programs of one scene differ.
+
+    Attributes:
+        arrays: names of those that the routine reads, then of its further results.
+        out: shape of the result, without worlds. options: values of the options of the routine's trace.
+    """
+
+    routine: Routine
+    arrays: tuple[str, ...]
+    out: tuple[int, ...]
+    granularity: str
+    options: tuple
+
+
 class Programs:
     """The programs of one scene.
 
@@ -33,7 +48,7 @@ class Programs:
 
     def __init__(self, run: Sweeps, plan: Plan):
         self.run, self.builder = run, Builder(run, plan)
-        self._programs: dict[tuple, Program | None] = {}
+        self._programs: dict[ProgramKey, Program | None] = {}
         self._products: dict[tuple[int, ...], mass_inverse_products.MassInverseProduct] = {}
 
     def forget(self) -> None:
@@ -68,12 +83,13 @@ class Programs:
             options: of the routine's trace.
         """
         names = (name if shape else f"{name}, a number" for name, shape in shapes.items())
-        key = routine, (*names, *(more or ())), out[1:], self.plan.of(routine), *options.values()
+        arrays, granularity = (*names, *(more or ())), self.plan.of(routine)
+        key = ProgramKey(routine, arrays, out[1:], granularity, (*options.values(),))
         if key in self._programs:
             return self._programs[key]
-        if self.plan.of(routine) == "node":
+        if granularity == "node":
             return None
-        variants = sum(1 for other in self._programs if other[0] is routine)
+        variants = sum(1 for other in self._programs if other.routine is routine)
         if options and variants >= routine.variants and routine.has_node_form:
             return None
         more = more or {}
@@ -109,20 +125,23 @@ class Programs:
         return {_title(key): program.operations for key, program in self._programs_in_use}
 
     @property
-    def _programs_in_use(self) -> list[tuple[tuple, Program]]:
+    def _programs_in_use(self) -> list[tuple[ProgramKey, Program]]:
         """The programs at the granularity that the plan gives now; others stay for graphs that hold them."""
-        found = self._programs.items()
-        return [(key, program) for key, program in found if program is not None and key[3] == self.plan.of(key[0])]
+        return [
+            (key, program)
+            for key, program in self._programs.items()
+            if program is not None and key.granularity == self.plan.of(key.routine)
+        ]
 
     def warps(self, routine: Routine) -> int | None:
         """Return how many warps share worlds in a routine's kernels; None before one is built."""
-        return max((program.warps for key, program in self._programs_in_use if key[0] is routine), default=None)
+        return max((program.warps for key, program in self._programs_in_use if key.routine is routine), default=None)
 
     def describe(self) -> list[str]:
         """Return a line for each kernel: its granularity, its operations in one world, and on CUDA what it takes."""
         lines = []
         for key, program in self._programs_in_use:
-            granularity = f"{key[3]}, {program.warps} warps" if program.warps > 1 else "tree"
+            granularity = f"{key.granularity}, {program.warps} warps" if program.warps > 1 else "tree"
             line = f"{_title(key)}  {granularity}, {program.operations} operations a world"
             if self.run.device.is_cuda:
                 found = wp.get_cuda_kernel_properties(program.kernel, self.run.device, program.block)
@@ -151,8 +170,8 @@ class Programs:
         return None if options.get(BODIES) else tree_programs.build(self.builder, job, links)
 
 
-def _title(key: tuple) -> str:
+def _title(key: ProgramKey) -> str:
     """Return what the user calls the computation of a program."""
-    routine, inputs, _, _, *options = key
-    title = routine.name if routine.title is None else routine.title(inputs, *options)
-    return f"{title} of substeps" if f"{SUBSTEPS}, a number" in inputs else title
+    routine = key.routine
+    title = routine.name if routine.title is None else routine.title(key.arrays, *key.options)
+    return f"{title} of substeps" if f"{SUBSTEPS}, a number" in key.arrays else title

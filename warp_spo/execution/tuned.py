@@ -48,8 +48,8 @@ class Tuned:
     def __str__(self) -> str:
         if not self.us:
             return f"{self.granularity}, the only one"
-        others = sorted(self.us.items(), key=lambda item: (item[0] != self.granularity, item[1]))
-        return f"{', '.join(f'{name} {us:.3g} us' for name, us in others)}, on {self.device}, {self.date}"
+        times = sorted(self.us.items(), key=lambda item: (item[0] != self.granularity, item[1]))
+        return f"{', '.join(f'{name} {us:.3g} us' for name, us in times)}, on {self.device}, {self.date}"
 
 
 def choice_of(us: Mapping[str, float], first_guess: str) -> str:

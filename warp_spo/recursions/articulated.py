@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..trace.scalars import Value, absolute, guarded, is_constant, quotient, reciprocal
+from ..trace.scalars import Value, absolute, is_constant, nan_unless_above, quotient, reciprocal
 from ..trace.spatial import (
     IDENTITY,
     ZERO,
@@ -159,9 +159,10 @@ def columns(link: Link, place: LinkPlacement) -> list[Vector]:
 def cancellation_sizes(
     link: Link, P: Articulated, units: list[int], through: list[tuple[Pose, Articulated]]
 ) -> list[Value]:
-    """Return the size of the terms that may cancel in each pivot; zero for the first pivot of a link with inertia.
+    """Return the size of the terms that may cancel in each pivot.
 
-    Later pivots of a hinge are the remainders of entries of P after the earlier ones. The entries of a body that does
+    It is zero for the first pivot of a link with inertia, unless that is singular and the hinge has several dofs. Later
+    pivots of a hinge are the remainders of entries of P after the earlier ones. The entries of a body that does
     not resist some motion of the hinge, such as a point mass, are as inexact as its largest ones. A link without
     inertia has only its children's articulated inertias, which vanish along their own hinges: the size is the sum of
     their magnitudes.
@@ -220,14 +221,19 @@ def _inexact(link: Link, units: list[int]) -> list[float]:
 
 def zero_or_nan(D: Value) -> Value:
     """Return zero, or NaN if D is not positive."""
-    D = guarded(D, 0.0)
+    D = nan_unless_above(D, 0.0)
     return D - D if is_constant(D) else D.graph.make("lost", D)
 
 
 def eliminate_unit(P: Articulated, unit: int, armature: Value, least: Value) -> tuple[Pivot, Articulated]:
+    """Return the pivot of a unit column, and P - U D^-1 U*.
+
+    Row and column of the unit are armature / D times U, in which nothing is subtracted. The pivot's inverse, and all
+    that it enters, is NaN where D is not above ``least``.
+    """
     U = Vector(P.entry(unit, j) for j in range(6))
     D = U[unit] + armature
-    inverse = reciprocal(guarded(D, least))
+    inverse = reciprocal(nan_unless_above(D, least))
     scaled, kept = U * inverse, armature * inverse
 
     def entry(i: int, j: int) -> Value:
@@ -242,7 +248,7 @@ def eliminate_unit(P: Articulated, unit: int, armature: Value, least: Value) -> 
 def eliminate(P: Articulated, column: Vector, armature: Value, least: Value) -> tuple[Pivot, Articulated]:
     n, f = P.apply(Vector(column[:3]), Vector(column[3:]))
     U = Vector((*n, *f))
-    D = guarded(guarded(dot(column, U) + armature, least), 0.0)
+    D = nan_unless_above(nan_unless_above(dot(column, U) + armature, least), 0.0)
     return Pivot(None, column, U, D, reciprocal(D)), downdate(P, U, D)
 
 

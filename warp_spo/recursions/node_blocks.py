@@ -27,7 +27,7 @@ from .articulated import columns
 from .kinematics import place_all
 from .model.link import BodyPlacement, Link
 from .model.rotations import fold_rotation
-from .model.rotors import locked_inertia, own_link
+from .model.rotors import locked_inertia, rotor_link
 
 if TYPE_CHECKING:
     from .model.tracing import Trace
@@ -46,7 +46,7 @@ def node_blocks(trace: Trace) -> list[Store]:
     for parent, child in scene.tree.edges:
         found["E_phi"] += _weight(trace, int(parent), int(child))
     for node in range(scene.body_count):
-        modes, own, rotor = _modes(trace, node), _hinge_links(trace, node), own_link(links, node)
+        modes, own, rotor = _modes(trace, node), _hinge_links(trace, node), rotor_link(links, node)
         size = scene.node_sizes[node] - 6 - modes  # of the rotor
         columns_of = {
             dof: _at_node(trace, node, link, column)
@@ -115,15 +115,22 @@ def _at_node(trace: Trace, node: int, link: Link, column: Vector) -> Six:
 
 
 def _weight(trace: Trace, parent: int, child: int) -> list[Value]:
-    """Return w(parent, child), row by row."""
+    """Return w(parent, child), row by row: what a unit force on the child's node does to the parent's.
+
+    Columns are forces on the child's rotor, on its modes, and (n; f) on its body; rows are the forces that these
+    cause on the parent's rotor, on its modes, and (n; f) on its body. Forces on the child's modes cause none, and the
+    parent's rotor feels none.
+    """
     links, scene = trace.links, trace.links.scene
     placement, inner = links.placements[child], links.placements[parent]
-    port, rotor = links.ports[child].link if child in links.ports else None, own_link(links, child)
-    modes, spins, above = _modes(trace, child), scene.node_sizes[child] - 6, scene.node_sizes[parent] - 6
-    spins, above = spins - modes, above - _modes(trace, parent)
+    rotor = rotor_link(links, child)
+    port = links.ports[child].link if child in links.ports else None  # of a flexible parent
+    modes = _modes(trace, child)
+    rotor_size = scene.node_sizes[child] - 6 - modes
+    parent_rotor_size = scene.node_sizes[parent] - 6 - _modes(trace, parent)
     starts: list[tuple[Link | None, Vector, Vector] | None] = []
-    for c in range(spins):
-        unit = _unit(c if spins == 6 else 2)
+    for c in range(rotor_size):
+        unit = _unit(c if rotor_size == 6 else 2)
         starts.append((rotor, Vector(unit[:3]), Vector(unit[3:])))
     starts += [None] * modes
     for c in range(6):
@@ -143,7 +150,7 @@ def _weight(trace: Trace, parent: int, child: int) -> list[Value]:
                 n, f = trace.places[id(over)].pose.force_to_parent(n, f)
                 over = over.parent
             back = inner.matrix.T
-            entries = [*[0.0] * above, *modal, *(back @ (n - cross(inner.offset, f))), *(back @ f)]
+            entries = [*[0.0] * parent_rotor_size, *modal, *(back @ (n - cross(inner.offset, f))), *(back @ f)]
         for row, entry in zip(rows, entries, strict=True):
             row.append(entry)
     return [x for row in rows for x in row]

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from .scalars import BRANCHES, Scalar, Value, cos, is_constant, logarithm, ordered, power, reciprocal, select, sin
 
 INFINITE = ("sqrt", "reciprocal", "quotient")  # may have an infinite derivative
-UNIT_DERIVATIVE = ("add", "cut", "reduced", "guarded")  # by each argument, except the limit of "guarded"
+UNIT_DERIVATIVE = ("add", "cut", "reduced", "nan_unless_above")  # by each argument, except the last one's limit
 ZERO_DERIVATIVE = ("input", "lost", "less", "floor", "lookup", "search")  # piecewise constant; "lost" is 0 or NaN
 
 
@@ -68,7 +68,7 @@ def reverse(
 def partial(scalar: Scalar, at: int) -> Value:
     """Return the derivative of a scalar with respect to its argument number ``at``."""
     op, args = scalar.op, scalar.args
-    if op in ZERO_DERIVATIVE or (op == "guarded" and at == 1):
+    if op in ZERO_DERIVATIVE or (op == "nan_unless_above" and at == 1):
         return 0.0
     if op in UNIT_DERIVATIVE:
         return 1.0

@@ -28,7 +28,7 @@ COST = {  # floating-point operations of a statement
     "neg": 0,
     "cut": 0,
     "absolute": 0,
-    "guarded": 1,
+    "nan_unless_above": 1,
     "select": 1,
     **dict.fromkeys((*BRANCHES, "less", "lost"), 1),
     "input": 0,
@@ -334,7 +334,7 @@ class Emitter:
         if op in SIGN:
             text = f"({texts[0]})" if is_literal(scalar.args[0]) else texts[0]  # "--1" is no expression
             return [f"const {T} {name} = {SIGN[op]}{text};"]
-        if op == "guarded":
+        if op == "nan_unless_above":
             return [f"const {T} {name} = {texts[0]} > {texts[1]} ? {texts[0]} : nan;"]
         if op == "select":
             return [f"const {T} {name} = {texts[0]} != 0 ? {texts[1]} : {texts[2]};"]

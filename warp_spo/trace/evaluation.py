@@ -28,7 +28,7 @@ FUNCTIONS: dict[str, Callable] = {
     "absolute": np.abs,
     "floor": np.floor,
     "lost": lambda a: a - a,
-    "guarded": lambda a, least: np.where(a > least, a, np.nan),
+    "nan_unless_above": lambda a, least: np.where(a > least, a, np.nan),
     "less": lambda a, b: np.where(a < b, 1.0, 0.0),
     "arctangent": np.arctan2,
     "exponential": np.exp,

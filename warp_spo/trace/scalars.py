@@ -224,12 +224,12 @@ def quotient(x: Value, y: Value) -> Value:
     return y.graph.make("quotient", x, y)
 
 
-def guarded(x: Value, least: Value) -> Value:
+def nan_unless_above(x: Value, least: Value) -> Value:
     """Return ``x``, or NaN where it is not above ``least``."""
     if is_constant(x) and is_constant(least):
         return x if x > least else math.nan
     graph = x.graph if not is_constant(x) else least.graph
-    return graph.make("guarded", x, least)
+    return graph.make("nan_unless_above", x, least)
 
 
 def select(mask: Value, x: Value, y: Value) -> Value:

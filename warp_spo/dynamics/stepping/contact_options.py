@@ -89,9 +89,9 @@ def refuse(dyn: Dynamics, call: Call, integrator: str) -> None:
         raise UnsupportedError(call.name, "closing loops in a scene with contacts", AMID_CONTACTS)
     if forced == "node":
         raise UnsupportedError(call.name, f"granularity={forced!r} with contacts", "use another one, or leave it out")
-    lacks, way = reason_against(dyn)
-    if lacks:
-        raise UnsupportedError(call.name, f"contact between bodies in a scene with {lacks}", way)
+    obstacle, way = reason_against(dyn)
+    if obstacle:
+        raise UnsupportedError(call.name, f"contact between bodies in a scene with {obstacle}", way)
     if isinstance(dyn.scene.ground, HeightField) and dyn.scene.ground.heights.size >= MOST_HEIGHTS[dyn.dtype.__name__]:
         way = "use dtype='float64', or a coarser field"
         raise UnsupportedError(call.name, f"a HeightField of {dyn.scene.ground.heights.size} points in float32", way)
@@ -118,6 +118,6 @@ def explain(dyn: Dynamics) -> str:
         held = dyn.programs.warps(routine) != 1  # 1: a kernel was built, and limbs found no room in it
         form = "a warp for each limb" if held else f"{form}: what limbs tell each other does not fit in shared memory"
     if dyn.scene.contact_pairs:
-        lacks, _ = reason_against(dyn)
-        form += f"; no step takes pairs of bodies beside {lacks}" if lacks else f"; pairs of bodies by {FEW_TIED}"
+        obstacle, _ = reason_against(dyn)
+        form += f"; no step takes pairs of bodies beside {obstacle}" if obstacle else f"; pairs of bodies by {FEW_TIED}"
     return f"{figures}; {passes}; {form}"

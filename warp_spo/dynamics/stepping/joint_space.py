@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import warp as wp
 
-from ...execution.joint_tables import joint_tables, lacking, motor_laws, way_out
+from ...execution.joint_tables import find_obstacle, joint_tables, motor_laws, way_out
 from ...execution.routine import Routine, SegmentForm, TuningHints
 from ...kernels import convex_pairs, convex_shapes, joint_space, near_pairs
 from ...recursions.contact import coupled, joint_system
@@ -63,7 +63,7 @@ def check_pair_solver(call: str, given: Any) -> None:
 
 def choose_solver(dyn: Dynamics) -> JointSpaceStep | None:
     """Return the solver of the pairs of bodies; None where there are none, generated code solves them, or no step."""
-    if not dyn.scene.contact_pairs or is_generated(dyn) or lacking(dyn.scene, dyn.variable):
+    if not dyn.scene.contact_pairs or is_generated(dyn) or find_obstacle(dyn.scene, dyn.variable):
         return None
     solver = JointSpaceStep(dyn)
     return solver if solver.fits else None
@@ -73,17 +73,17 @@ def reason_against(dyn: Dynamics) -> tuple[str, str]:
     """Return what of a scene keeps all steps from taking its pairs of bodies, and the way out; "" twice if one does."""
     if not dyn.scene.contact_pairs or dyn._joint_space is not None or is_generated(dyn):
         return "", ""
-    lacks = lacking(dyn.scene, dyn.variable)
-    return (lacks, way_out(lacks)) if lacks else (NO_ROOM, NO_ROOM_WAY)
+    obstacle = find_obstacle(dyn.scene, dyn.variable)
+    return (obstacle, way_out(obstacle)) if obstacle else (NO_ROOM, NO_ROOM_WAY)
 
 
 def reason_against_gradients(scene: Scene, variable: tuple[str, ...]) -> str:
     """Return why steps of a scene whose bodies touch have no gradients; "" if they have."""
     if scene.dof_count == 0:
         return "nothing can move"
-    lacks = lacking(scene, variable)
-    if lacks:
-        return f"{lacks} have no solution in joint space"
+    obstacle = find_obstacle(scene, variable)
+    if obstacle:
+        return f"{obstacle} have no solution in joint space"
     return "anchors vary" if {"joint_X_p", "joint_X_c"} & set(variable) else ""
 
 

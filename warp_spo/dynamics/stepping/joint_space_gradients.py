@@ -42,9 +42,11 @@ class JointSpaceGradients:
         sizes = solver.tables.sizes
         self.kernel = joint_adjoint.adjoint(sizes, T)
         near, pairs = solver.near_count, sizes.pairs
-        self.narrow_back = near_pairs_adjoint.narrow_back(pairs, near, solver.routines)
-        self.add_wrenches = near_pairs_adjoint.add_wrenches(pairs, near)
-        self.widen, self.narrow = (near_pairs_adjoint.widen(*both) for both in ((T, wp.float64), (wp.float64, T)))
+        self.narrow_phase_back = near_pairs_adjoint.narrow_phase_back(pairs, near, solver.routines)
+        self.poses_back = near_pairs_adjoint.poses_back(pairs, near)
+        self.to_float64, self.from_float64 = (
+            near_pairs_adjoint.convert(*both) for both in ((T, wp.float64), (wp.float64, T))
+        )
         self.wide: dict[str, wp.array] = {}
         self.wrenches = wp.zeros((self.worlds, 12 * near), dtype=wp.float64, device=self.device)
         wide: dict[int, wp.array] = {}
@@ -152,7 +154,7 @@ class JointSpaceGradients:
         return by_pass[0], by_pass[1], found
 
     def _points_back(self, h: float, touches_bar: wp.array, poses_bar: wp.array) -> None:
-        """Launch the gradients by the poses of the bodies from those by the points of near pairs."""
+        """Overwrite ``poses_bar``, the gradients by the poses of the bodies, from those by the points of near pairs."""
         solver = self.solver
         on: dict[str, Any] = {"device": self.device, "block_dim": 64}
         wide = {name: self._wide(name, array) for name, array in
@@ -161,12 +163,12 @@ class JointSpaceGradients:
         slack = solver.margin + solver.gravity * h * h
         inputs = [self.worlds, wide["poses"], wide["velocities"], solver.which, self.sides, slack, h, *self.shapes]
         inputs += [solver.near, wide["touches"], wide["touches_bar"]]
-        launches.launch(self.narrow_back, solver.near_count * self.worlds, inputs, [self.wrenches], **on)
+        launches.launch(self.narrow_phase_back, solver.near_count * self.worlds, inputs, [self.wrenches], **on)
         found = self._wide("poses_bar", poses_bar, copy=False)
         inputs = [self.worlds, wide["poses"], solver.which, solver.near, self.wrenches]
-        launches.launch(self.add_wrenches, self.worlds * poses_bar.shape[1], inputs, [found], **on)
+        launches.launch(self.poses_back, self.worlds * poses_bar.shape[1], inputs, [found], **on)
         if found is not poses_bar:
-            launches.launch(self.narrow, found.size, [found.flatten()], [poses_bar.flatten()], **on)
+            launches.launch(self.from_float64, found.size, [found.flatten()], [poses_bar.flatten()], **on)
 
     def _wide(self, name: str, array: wp.array, copy: bool = True) -> wp.array:
         """Return an array in float64, the array itself if it is one."""
@@ -175,7 +177,9 @@ class JointSpaceGradients:
         if name not in self.wide:
             self.wide[name] = wp.zeros(array.shape, dtype=wp.float64, device=self.device)
         if copy:
-            launches.launch(self.widen, array.size, [array.flatten()], [self.wide[name].flatten()], device=self.device)
+            launches.launch(
+                self.to_float64, array.size, [array.flatten()], [self.wide[name].flatten()], device=self.device
+            )
         return self.wide[name]
 
     def _combine(self, a: float, x: wp.array, b: float, y: wp.array, out: wp.array) -> None:

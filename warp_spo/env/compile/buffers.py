@@ -79,30 +79,30 @@ class Storage:
     def changing(self) -> dict[str, torch.Tensor]:
         """Return the tensors that steps change, by name; "out" holds all results."""
         results = {self._output(name) for name in self.places}
-        own = {name for name, buffer in self.buffers.items() if buffer.memory_order != SHARED} | {"key"}
+        own = {name for name, buffer in self.buffers.items() if buffer.kind != SHARED} | {"key"}
         own -= {FAULT}
         return {name: x for name, x in self.tensors.items() if name in own - results} | {"out": self.out}
 
     def worlds_of(self) -> dict[str, tuple[torch.Tensor, int]]:
         """Return the tensors of worlds that steps change and read again, each with its axis of worlds, by name."""
-        own = {name: buffer for name, buffer in self.buffers.items() if buffer.memory_order != SHARED}
+        own = {name: buffer for name, buffer in self.buffers.items() if buffer.kind != SHARED}
         results = {self._output(name) for name in self.places}
         columns = (COLUMN, COUNT, FOUND)
-        return {n: (self.tensors[n], int(b.memory_order in columns)) for n, b in own.items() if n not in results}
+        return {n: (self.tensors[n], int(b.kind in columns)) for n, b in own.items() if n not in results}
 
     @property
     def bytes_per_world(self) -> int:
         """Bytes that a world takes, without what all worlds share."""
-        own = (buffer.tensor.nbytes for buffer in self.buffers.values() if buffer.memory_order != SHARED)
+        own = (buffer.tensor.nbytes for buffer in self.buffers.values() if buffer.kind != SHARED)
         return sum(own) // self.worlds
 
     # -- inside ----------------------------------------------------------------------------------------------------
     def _zeros(self, *shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
         return torch.zeros(shape, dtype=dtype, device=self.device)
 
-    def _add(self, name: str, tensor: torch.Tensor, memory_order: str = ROW) -> torch.Tensor:
+    def _add(self, name: str, tensor: torch.Tensor, kind: str = ROW) -> torch.Tensor:
         self.tensors[name] = tensor
-        self.buffers[name] = Buffer(tensor.view(self.worlds, -1) if memory_order == ROW else tensor, memory_order)
+        self.buffers[name] = Buffer(tensor.view(self.worlds, -1) if kind == ROW else tensor, kind)
         return tensor
 
     def _add_state(self, layout: MemoryLayout) -> None:
@@ -183,4 +183,4 @@ class Storage:
             rows, held = self._rows(self.out, name), self._output(name)
             whole = name == "done"
             self._add(held, rows.view(-1).view(torch.int32) if whole else rows, INT if whole else ROW)
-            self.buffers[held] = self.buffers[held]._replace(passes=name in apart)
+            self.buffers[held] = self.buffers[held]._replace(bypasses_caches=name in apart)

@@ -28,27 +28,27 @@ class Buffer(NamedTuple):
 
     Attributes:
         tensor: torch tensor; its memory is the array's.
-        memory_order: ROW: float32 [world, entry]. COLUMN: float32 [entry, world],
+        kind: ROW: float32 [world, entry]. COLUMN: float32 [entry, world],
             which neighbouring threads read side by side.
             SHARED: float32 [entry], the same for all worlds. INT: int32 [world]. LONG: int64 [world]. MASK: bool
             [world]. COUNT: float32 [entry, world]; the value that a kernel stores is the number of the entry to which
             one is added, counted from 1, and 0 for none. FOUND: float32 [entry, world]; a value below zero leaves the
             entry as it is. It is stored last.
-        passes: it is large, and no kernel reads it: it shall not displace from the caches what others read.
+        bypasses_caches: it is large, and no kernel reads it: it shall not displace from the caches what others read.
     """
 
     tensor: Any
-    memory_order: str = ROW
-    passes: bool = False
+    kind: str = ROW
+    bypasses_caches: bool = False
 
     @property
     def set(self) -> str:
         """C++ macro that stores an entry, see ``kernels.row_chunks``."""
-        return "SET_PASSING" if self.passes else "SET"
+        return "SET_PASSING" if self.bypasses_caches else "SET"
 
     def place(self, name: str, entry: str) -> str:
         """Return C++ for an entry in the thread's world."""
-        entries = self.tensor.shape[-1] if self.memory_order == ROW else 0
+        entries = self.tensor.shape[-1] if self.kind == ROW else 0
         return {
             ROW: f"{name}.data[world * {entries} + {entry}]",
             COLUMN: f"{name}.data[(long long)({entry}) * worlds + world]",
@@ -58,30 +58,34 @@ class Buffer(NamedTuple):
             INT: f"((int*){name}.data)[world]",
             LONG: f"((long long*){name}.data)[world]",
             MASK: f"{name}.data[world]",
-        }[self.memory_order]
+        }[self.kind]
 
     def load(self, name: str, entry: str) -> str:
         """Return C++ that reads an entry as float."""
         place = self.place(name, entry)
-        return place if self.memory_order in (ROW, COLUMN, SHARED, FOUND) else f"(float)({place})"
+        return place if self.kind in (ROW, COLUMN, SHARED, FOUND) else f"(float)({place})"
 
     def store(self, name: str, entry: str, value: str) -> str:
-        """Return C++ that writes an entry."""
-        if self.passes:
+        """Return C++ that writes an entry of the thread's world; the kinds COUNT and FOUND have rules of their own.
+
+        COUNT adds one to entry ``value`` - 1, whatever ``entry`` is, and does nothing for 0. FOUND does nothing for
+        a value below zero.
+        """
+        if self.bypasses_caches:
             return f"{self.set}({self.place(name, entry)}, {value});"
-        if self.memory_order == COUNT:
+        if self.kind == COUNT:
             return f"if ({value} != 0) {self.place(name, value)} += 1;"
-        if self.memory_order == FOUND:
+        if self.kind == FOUND:
             return f"if ({value} >= 0) {self.place(name, entry)} = {value};"
-        kind = {INT: "(int)", LONG: "(long long)", MASK: "0 != "}.get(self.memory_order, "")
-        return f"{self.place(name, entry)} = {kind}({value});"
+        cast = {INT: "(int)", LONG: "(long long)", MASK: "0 != "}.get(self.kind, "")
+        return f"{self.place(name, entry)} = {cast}({value});"
 
     def warp(self) -> Any:
         """Return the flat Warp array over the same memory."""
         import torch
 
         flat = self.tensor.reshape(-1)[:MOST_ENTRIES]  # kernels take its address alone
-        if self.memory_order == MASK:
+        if self.kind == MASK:
             return wp.from_torch(flat, dtype=wp.bool)
         return wp.from_torch(flat.view(torch.float32), dtype=wp.float32)
 
@@ -98,6 +102,7 @@ class FusedKernel:
     Attributes:
         graph: of the trace.
         stores: what the kernel writes, in order; with rows, what a thread does for its first, for its second and so on.
+        of_rows: the stores of each row of a thread; a thread with fewer rows than others skips its last list.
         at_once: rows of a thread. threads: of a world, where it has rows.
         draws: how many random numbers it uses.
         ticks: C++ of how many steps it counts when it ends, after which all random numbers are new ones; "" for none.
@@ -154,7 +159,7 @@ class FusedKernel:
         read = self.read_arrays()
         stored: dict[str, set[int]] = {}
         for item in self.stores:
-            if buffers[item.array].memory_order == ROW and item.array not in read and not self.rows:
+            if buffers[item.array].kind == ROW and item.array not in read and not self.rows:
                 stored.setdefault(item.array, set()).add(item.index[0])
         found = {}
         for name, entries in stored.items():
@@ -184,7 +189,7 @@ class FusedKernel:
         def store(array: str, entry: str, value: str) -> str:
             if array in wide:
                 return f"PUT({array}, {buffers[array].tensor.shape[-1]}, {entry}, {value})"
-            own = more if buffers[array].memory_order == ROW else ""
+            own = more if buffers[array].kind == ROW else ""
             return f"{'if (mine) ' if wide else ''}{buffers[array].store(array, entry + own, value)}"
 
         emitter = Emitter(
@@ -217,7 +222,7 @@ class FusedKernel:
         else:
             head = ["if (thread >= worlds) return;", "const long long world = thread;"]
             tail = [count]
-        if wide or any(buffers[name].passes for name in names):
+        if wide or any(buffers[name].bypasses_caches for name in names):
             head, tail = [row_chunks.STORES, *head], [*tail, row_chunks.END_STORES]
         tail += [philox.UNDEFINE] if self.draws else []
         found = "".join(parts)
@@ -235,8 +240,8 @@ class FusedKernel:
         """Return the listings of all statements, and their texts with what belongs between them."""
         read = self.read_arrays()
         at_once = lambda item: item.array not in read or (not wide and replaces(item))  # noqa: E731
-        found = [item for item in self.stores if buffers[item.array].memory_order == FOUND]  # depend on all others
-        others = [item for item in self.stores if buffers[item.array].memory_order != FOUND]
+        found = [item for item in self.stores if buffers[item.array].kind == FOUND]  # depend on all others
+        others = [item for item in self.stores if buffers[item.array].kind != FOUND]
         late = [item for item in others if not at_once(item)]  # after all reads of what they overwrite
         early = [item for item in others if at_once(item) and item.array not in wide]
         if self.rows:

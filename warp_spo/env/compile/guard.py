@@ -101,8 +101,11 @@ class Guard:
         return [self.check(cause, values) for cause, values in parts.items()]
 
     # -- worlds that end ---------------------------------------------------------------------------------------------
-    def mend(self, w: World, state: Sequence[Check]) -> World:
-        """Return a world at the end of its episode, at rest in default_q where its ``state`` is out of bounds."""
+    def finite_end(self, w: World, state: Sequence[Check]) -> World:
+        """Return a copy of a world with a finite state, which reset events read as ``w.before`` when its episode ends.
+
+        It has the world's q and qd, or default_q and zeros where a check of ``state`` is not fine.
+        """
         ended, fine = copy.copy(w), Condition(1.0)
         for check in state:
             fine = fine & check.fine

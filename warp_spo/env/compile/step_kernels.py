@@ -183,7 +183,7 @@ class Tracing:
             with naming(f"termination {name!r}"):
                 ends[name] = condition(f"termination {name!r} returned", term(w))
         ends |= self.guard.ends(fault)
-        self.bad, self.ended = bad, self.guard.mend(w, state)
+        self.bad, self.ended = bad, self.guard.finite_end(w, state)
         measured = self._measure(w, bad)
         self.guard.hold(w, list(w.kept), bad)
         terminated = bad

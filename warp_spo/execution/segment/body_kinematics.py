@@ -46,7 +46,10 @@ def build(builder: Builder, job: Job, links: Links) -> Program | None:
 
 
 def _assign_to_warps(traversals: list[list]) -> list[list]:
-    """Return the traversals of each warp in a row; the longest come first, each to the warp that has least to do."""
+    """Return the steps of each warp: those of its traversals, one after the other.
+
+    The longest traversals come first, each to the warp that has least to do.
+    """
     found: list[list] = [[] for _ in traversals[:MOST_WARPS]]
     for traversal in sorted(traversals, key=len, reverse=True):
         min(found, key=len).extend(traversal)

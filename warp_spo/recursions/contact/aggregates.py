@@ -17,7 +17,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 from ...trace.emission import Store
-from ...trace.scalars import Entry, Value, branch, guarded, reciprocal
+from ...trace.scalars import Entry, Value, branch, nan_unless_above, reciprocal
 from ...trace.spatial import IDENTITY, ZERO, Articulated, Matrix, Pose, Twist, Vector, cross, dot, total
 from .. import articulated
 from ..articulated import NO_INERTIA
@@ -56,8 +56,8 @@ class Tie(NamedTuple):
     J: dict[tuple[int, int], Vector]
 
 
-class Node:
-    """One aggregate in the sweeps of a pass.
+class AggregateSolve:
+    """The elimination of one aggregate in the inward sweep of a pass, and its solution in the outward sweep.
 
     Args:
         trace: the evaluation. plan: all aggregates. aggregate: this one. mask: not zero where one of its couples acts.
@@ -97,7 +97,7 @@ class Node:
         rates: list[Value] = []
         base = self.aggregate.base
         for at in reversed(range(len(self.dofs))):
-            inverse = reciprocal(guarded(D[at, at], 0.0))
+            inverse = reciprocal(nan_unless_above(D[at, at], 0.0))
             row = [D.get((at, i), 0.0) for i in range(at)]
             shares, rate = [x * inverse for x in row], eps[at] * inverse
             for i, share in enumerate(shares):
@@ -167,7 +167,7 @@ class Node:
                     D[at, number[id(link), j]] = dot(H[j], force)
                 D[at, at] = D[at, at] + stiffened.armature[i]
                 eps[at] = right[i] - dot(column, z)
-                U[at] = self._carry(link, force, at, D, number)
+                U[at] = self._force_on_base(link, force, at, D, number)
             for (i, j), x in link.coupling_inertia.items():
                 first, last = sorted((number[id(link), i], number[id(link), j]))
                 D[last, first] = D[last, first] + x
@@ -181,8 +181,11 @@ class Node:
                         D[at, other] = D.get((at, other), 0.0) + dot(column, force)
         return D, U, eps, whole[key(base)], push[key(base)]
 
-    def _carry(self, link: Link, force: Vector, at: int, D: dict, number: dict) -> Vector:
-        """Return a force on a link as its base feels it; entries of D for the dofs on the way are row ``at``."""
+    def _force_on_base(self, link: Link, force: Vector, at: int, D: dict, number: dict) -> Vector:
+        """Return the force P H* of dof ``at``, a column of a link's hinge, as the base of the aggregate feels it.
+
+        Write its products with the columns of the dofs between link and base into row ``at`` of the mass matrix D.
+        """
         force, on = force_to_parent(self._hinge(link)[0], force), self.plan.over[id(link)]
         while on is not None and on is not self.aggregate.base:
             pose, H = self._hinge(on)
@@ -269,7 +272,7 @@ def force_to_parent(pose: Pose, z: Vector) -> Vector:
 
 
 def reduce(
-    trace: Trace, plan: TiePlan, nodes: dict[int, Node], terms: StepTerms, tau: Entry, phases: PhaseBuilder
+    trace: Trace, plan: TiePlan, nodes: dict[int, AggregateSolve], terms: StepTerms, tau: Entry, phases: PhaseBuilder
 ) -> tuple[Factors, dict]:
     """Sweep inward; ``nodes`` by id of the first link of each aggregate. Return factors and D^-1 eps, by link."""
     done: Factors = {}
@@ -298,7 +301,9 @@ def reduce(
     return done, rates
 
 
-def expand(trace: Trace, plan: TiePlan, nodes: dict[int, Node], done: Factors, rates: dict, alpha: dict) -> list[Store]:
+def expand(
+    trace: Trace, plan: TiePlan, nodes: dict[int, AggregateSolve], done: Factors, rates: dict, alpha: dict
+) -> list[Store]:
     """Sweep outward; ``alpha`` receives the accelerations of links. Return the stores of qdd."""
     stores: list[Store] = []
     found: dict[int, tuple[list[Value], Twist]] = {}

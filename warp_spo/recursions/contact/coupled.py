@@ -16,7 +16,7 @@ from ..articulated_sweeps import Factors, StepTerms
 from ..model.links import Link, Links
 from ..step.phases import StepPhases
 from . import aggregates
-from .aggregates import LAST, Node, Seat, Seats, Tie, add
+from .aggregates import LAST, AggregateSolve, Seat, Seats, Tie, add
 from .pairs import place_axes_of, values_of, velocities_of
 from .points import TracedContactPoint, with_ancestors
 from .step import ContactStepTrace, PointState
@@ -100,12 +100,12 @@ class CoupledStep(ContactStepTrace):
             elif couple.g is None:
                 add(terms.inertia, id(couple.f), K)
                 add(terms.force, id(couple.f), load)
-        self.nodes: dict[int, Node] = {}
+        self.nodes: dict[int, AggregateSolve] = {}
         for aggregate in self.plan.aggregates:
             mask = total(trace.graph.input(COUPLED, number) for number in aggregate.couples)
             mine = [ties[number] for number in aggregate.couples]
             first, seats = aggregate.links[0], self.seats[aggregate.couples[0]]
-            self.nodes[id(first)] = Node(trace, self.plan, aggregate, mask, seats, mine)
+            self.nodes[id(first)] = AggregateSolve(trace, self.plan, aggregate, mask, seats, mine)
             self.phases.add_invariants(x for tie in mine for column in tie.J.values() for x in column)
             for seat in seats.values():
                 self.phases.add_invariants([*(x for row in seat.turn for x in row), *seat.at])

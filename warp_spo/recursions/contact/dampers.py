@@ -69,10 +69,10 @@ def load(points: Sequence[TracedContactPoint], pushes: Sequence[Value], P: Artic
     return Vector((*n, *f))
 
 
-def chosen(
+def computed_where(
     mask: Value, new: tuple[Articulated, Vector], old: tuple[Articulated, Vector], name: str
 ) -> tuple[Articulated, Vector]:
-    """Return damper and load ``new`` where ``mask`` is not zero, else ``old``, in a branch."""
+    """Return damper and load ``new``, computed only where ``mask`` is not zero, and ``old`` elsewhere."""
     pairs = zip((*new[0].packed, *new[1]), (*old[0].packed, *old[1]), strict=True)
     found = [branch(mask, a, b, name) for a, b in pairs]
     return Articulated.unpacked(found[:-6]), Vector(found[-6:])

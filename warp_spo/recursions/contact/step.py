@@ -27,7 +27,7 @@ from ..step.joint_laws import Law, add_laws
 from ..step.phases import StepPhases
 from ..step.step import GAIN, Step
 from .contact_culling import CullGroup, group_points
-from .dampers import SEVERAL, chosen, damper, load, turning_damper
+from .dampers import SEVERAL, computed_where, damper, load, turning_damper
 from .law import PointReport, PointResult, PointState, begin_point, finish_point, force_at, normal_force
 from .points import TracedContactPoint, ground_offset, keeps_arms, own_points, place_points
 from .secant_laws import PassVariables, SecantLaw, largest, single_dofs
@@ -222,23 +222,26 @@ class ContactStepTrace(Step):
         return begin_point(point, self.trace.links.gravity, self.h)
 
     def _step_terms(self, points: list[TracedContactPoint], states: list[PointState]) -> StepTerms:
-        """Return what the laws of the joints, and dampers and loads of the points, add to the links."""
+        """Return dampers and loads of the points by link, and :meth:`_with_resistance`, by which sweeps add joint laws.
+
+        Branches and groups change no value: they let code skip sums that are zero because no point may touch.
+        """
         terms, on = StepTerms(self._with_resistance), dict[int, list[tuple[TracedContactPoint, PointState]]]()
         for point, state in zip(points, states, strict=True):
             if point.link is not None:
                 on.setdefault(id(point.link), []).append((point, state))
         for key, pressed in on.items():
             self.trace.label(pressed[0][0].link, "c")  # type: ignore[arg-type]
-            floors = [x for x in pressed if x[0].near is None or is_constant(x[0].near)]
-            P, push = self._sum(floors)
-            if pressed[0][0].near is not None:  # the points of a ground with walls are rarely near it all at once
-                touched = total(point.works(state.candidate) for point, state in floors)
-                P, push = chosen(touched, (P, push), (NOTHING, NO_PUSH), f"floors of {key}")
-            walls = [x for x in pressed if x[0].near is not None and not is_constant(x[0].near)]
-            if walls:
-                more, pushed = self._sum(walls)
-                touched = total(state.candidate for _, state in walls)
-                P, push = chosen(touched, (P + more, push + pushed), (P, push), f"walls of {key}")
+            always_near = [x for x in pressed if x[0].near is None or is_constant(x[0].near)]
+            P, push = self._sum(always_near)
+            if pressed[0][0].near is not None:  # over a ground with walls none of them may touch
+                touched = total(point.works(state.candidate) for point, state in always_near)
+                P, push = computed_where(touched, (P, push), (NOTHING, NO_PUSH), f"always_near of {key}")
+            at_times_near = [x for x in pressed if x[0].near is not None and not is_constant(x[0].near)]
+            if at_times_near:
+                more, pushed = self._sum(at_times_near)
+                touched = total(state.candidate for _, state in at_times_near)
+                P, push = computed_where(touched, (P + more, push + pushed), (P, push), f"at_times_near of {key}")
             if key in self.cull_groups:
                 P, push = self.cull_groups[key].damper_and_load(P, push)
             terms.inertia[key], terms.force[key] = P, push

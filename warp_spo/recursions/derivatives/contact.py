@@ -139,7 +139,7 @@ class PassAdjoint(OnePass):
         return place_points(self.trace, self.joint_laws, self.qd)
 
     def _twists(self, rate: Entry) -> Twists:
-        """Return (omega; v) of the links by id for the rates of the dofs."""
+        """Return (omega; v) of the links by id for the rates of the dofs, each as :meth:`_read_twist` returns it."""
         found: Twists = {}
         for link in self.trace.active_links:
             self.trace.label(link, "t")
@@ -149,7 +149,7 @@ class PassAdjoint(OnePass):
         return found
 
     def _read_twist(self, link: Link, twist: Twist) -> Twist:
-        """Return a twist of a link, as what follows from it reads it."""
+        """Return a twist as the rest of the trace reads it: cut from its history where another kernel has that."""
         return twist
 
     def _or_input(self, known: dict[int, Value], name: str) -> Entry:

@@ -165,8 +165,11 @@ class Closure:
             turning, sliding = turning + dot(w, w), sliding + dot(v, v)
         return sliding, turning
 
-    def squared_distances(self, places: dict[int, LinkPlacement]) -> Value:
-        """Return the sum of squares of the distances that cancel where no velocity moves the joint."""
+    def rounding_scale(self, places: dict[int, LinkPlacement]) -> Value:
+        """Return the sum of squares of the distances from which the joint's velocities are computed [m^2].
+
+        A sum of squared velocities below VANISHES times it is rounding, see :meth:`sizes`.
+        """
         inner, outer = self._anchors(places)
         arms = [arm for _, _, _, arm in self._columns(places, outer)]
         return total(dot(far, far) for far in (inner.origin, outer.origin, *arms))
@@ -324,18 +327,18 @@ def _fixed_sizes(scene: Scene) -> list[FixedSizes]:
     links, rng = Links(one_world(scene)), np.random.default_rng(0)
     joints, sums = [Closure(links, loop) for loop in scene.loops], []
     places = {id(link): place_link(link, lambda c: links.graph.input("q", c)) for link in links.links}
-    values = [x for joint in joints for x in (*joint.sums_of_squares(places), joint.squared_distances(places))]
+    values = [x for joint in joints for x in (*joint.sums_of_squares(places), joint.rounding_scale(places))]
     for _ in range(3):
         q = scene.neutral_q + rng.uniform(-1.0, 1.0, len(scene.neutral_q))
         found = evaluate(values, lambda _, index, q=q: q[index[0]])  # type: ignore[misc]
         sums.append(np.array(found, dtype=float).reshape(-1, 3))
-    of_velocities, of_angular, squared_distances = np.max(sums, axis=0).T if joints else np.zeros((3, 0))
+    of_velocities, of_angular, rounding_scales = np.max(sums, axis=0).T if joints else np.zeros((3, 0))
     return [
         (
-            float(squared_distance) if velocities <= VANISHES * squared_distance else None,
+            float(scale) if velocities <= VANISHES * scale else None,
             1.0 if angular <= VANISHES else None,
         )
-        for velocities, angular, squared_distance in zip(of_velocities, of_angular, squared_distances, strict=True)
+        for velocities, angular, scale in zip(of_velocities, of_angular, rounding_scales, strict=True)
     ]
 
 

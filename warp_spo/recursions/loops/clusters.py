@@ -19,7 +19,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from ...trace.scalars import Entry, Value, absolute, guarded, reciprocal, sqrt
+from ...trace.scalars import Entry, Value, absolute, nan_unless_above, reciprocal, sqrt
 from ...trace.spatial import ZERO, Articulated, Twist, Vector, dot, total
 from .. import articulated, newton_euler
 from ..articulated import NO_INERTIA
@@ -223,7 +223,7 @@ def _pivots(D: list[list[Value]], least: list[Value]) -> tuple[list[list[Value]]
             weighted.append(row[j] - total(weighted[k] * L[j][k] for k in range(j)))
         L.append([w * r for w, r in zip(weighted, inverse, strict=True)])
         pivot = row[i] - total(w * entry for w, entry in zip(weighted, L[i], strict=True))
-        d.append(guarded(guarded(pivot, least[i]), 0.0))
+        d.append(nan_unless_above(nan_unless_above(pivot, least[i]), 0.0))
         inverse.append(reciprocal(d[i]))
     return L, d, inverse
 

@@ -49,8 +49,12 @@ def columns_of_all(loops: ClosedLoops) -> dict[int, Columns]:
     return found
 
 
-def demand(loops: ClosedLoops) -> Columns:
-    """Return k by dof, zero of dofs that no loop ties; after the links are placed with their velocities."""
+def loop_accelerations(loops: ClosedLoops) -> Columns:
+    """Return k of qdd = X qdd[independent] + k by dof; after the links are placed with their velocities.
+
+    It is the acceleration that loops demand at these velocities while the independent dofs do not accelerate; zero for
+    dofs that no loop ties.
+    """
     found: Columns = dict.fromkeys(range(loops.trace.links.scene.dof_count), 0.0)
     for cluster in loops.clusters:
         found |= loops.demanded_accelerations(loops.constrain(cluster, loops.embedding.dofs))
@@ -60,7 +64,7 @@ def demand(loops: ClosedLoops) -> Columns:
 def accelerations(loops: ClosedLoops) -> Columns:
     """Return X qdd + k by dof, for the independent entries of "qdd"; after the links are placed."""
     moves, given = "qd" in loops.trace.inputs, loops.trace.vector("qdd")
-    qdd = demand(loops) if moves else dict.fromkeys(range(loops.trace.links.scene.dof_count), 0.0)
+    qdd = loop_accelerations(loops) if moves else dict.fromkeys(range(loops.trace.links.scene.dof_count), 0.0)
     for free, column in columns_of_all(loops).items():
         for dof, x in column.items():
             qdd[dof] = qdd[dof] + x * given(free)
@@ -266,7 +270,7 @@ def jacobian_bias(trace: Trace, frames: tuple, embedding: Embedding) -> list[Sto
     loops = ClosedLoops(trace, embedding)
     kinematics.place_all(trace, moves=True)
     return kinematics.accelerations_of_frames(
-        trace, frames, kinematics.link_accelerations(trace, demand(loops).__getitem__)
+        trace, frames, kinematics.link_accelerations(trace, loop_accelerations(loops).__getitem__)
     )
 
 
@@ -286,4 +290,4 @@ def centroidal_momentum_bias(trace: Trace, embedding: Embedding) -> list[Store]:
     """out [6] = A k + A' qd"""
     loops = ClosedLoops(trace, embedding)
     place_links(trace, moves=True)
-    return momentum.centroidal_momentum_bias(trace, demand(loops).__getitem__)
+    return momentum.centroidal_momentum_bias(trace, loop_accelerations(loops).__getitem__)

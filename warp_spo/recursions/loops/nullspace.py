@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from ...trace.scalars import Entry, Value, absolute, guarded, is_constant, reciprocal, select, sqrt
+from ...trace.scalars import Entry, Value, absolute, is_constant, nan_unless_above, reciprocal, select, sqrt
 from ...trace.spatial import total
 from ..articulated import zero_or_nan
 
@@ -67,7 +67,7 @@ class NullSpace:
         self.basis = [self._reflect_back({column: 1.0}) for column in live]
 
     def _reflect(self, row: int, left: dict, size: Value, waiting: list, live: list, epsilon: float) -> tuple:
-        square = guarded(total(x * x for x in left.values()), (LEAST * epsilon) ** 2 * size)
+        square = nan_unless_above(total(x * x for x in left.values()), (LEAST * epsilon) ** 2 * size)
         self.margins.append(square * reciprocal(size))
         self.lost_pivot = self.lost_pivot + zero_or_nan(square)
         if not left:

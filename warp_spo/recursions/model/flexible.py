@@ -46,7 +46,12 @@ class Flexible(NamedTuple):
 
 
 def deform(links: Links, node: int, dof: int, coordinate: int, armature: tuple) -> None:
-    """Add the pieces of a body whose modal coordinates start at entry ``dof`` of qd and ``coordinate`` of q."""
+    """Add the pieces of a body whose modal coordinates start at entry ``dof`` of qd and ``coordinate`` of q.
+
+    The leader moves as the body's centre of mass does in the modes, and has their armature. The rest is the inertia
+    that mass points leave; without them it is the whole body's. Where the modes move the rest, it is the leader's
+    without mass points, and else that of a further piece. Where they do not, it belongs to the link of the body frame.
+    """
     scene, placement = links.scene, links.placements[node]
     modes = scene.bodies[node].modes
     assert modes is not None
@@ -64,16 +69,16 @@ def deform(links: Links, node: int, dof: int, coordinate: int, armature: tuple) 
     leader.shared_dofs = SharedDofs([leader], {(int(i), int(j)): float(mean.armature[i, j]) for i, j in pairs})
     whole = links.rigid(node, np.eye(3), links.values["body_com"][node])
     rest = whole if modes.points is None else _less(whole, modes.points.inertia[:6, :6])
-    follows = mean.rest_slopes.any()
-    own = links.flexible[node] = Flexible(placement.link, axes, origin, leader, NOTHING if follows else rest)
+    rest_moves = mean.rest_slopes.any()
+    own = links.flexible[node] = Flexible(placement.link, axes, origin, leader, NOTHING if rest_moves else rest)
     links.append(leader)
 
     if placement.link is not None:
         placement.link.add(Pose(None, axes, origin).rigid_to_parent(own.rest))
-    if follows:
+    if rest_moves:
         center = Vector(mean.rest_center.tolist())
-        follower = leader if modes.points is None else add_piece(links, own, Deflection(mean.rest_slopes), center)
-        follower.add(Pose(None, None, -center).rigid_to_parent(rest))
+        rest_piece = leader if modes.points is None else add_piece(links, own, Deflection(mean.rest_slopes), center)
+        rest_piece.add(Pose(None, None, -center).rigid_to_parent(rest))
     leader.compensate(links.values["body_gravcomp"].tolist()[node] * whole.mass, ZERO)
     if modes.points is not None:
         shapes, bends = modes.points.shapes, modes.points.stiffening

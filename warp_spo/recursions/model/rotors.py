@@ -60,6 +60,6 @@ def locked_inertia(rotor: Rotor, axes: Matrix, origin: Vector) -> Rigid:
     return Pose(None, axes @ rotation_to_axis(rotor.axis), at).rigid_to_parent(across_axis(rotor))
 
 
-def own_link(links: Links, node: int) -> Link | None:
+def rotor_link(links: Links, node: int) -> Link | None:
     """Return the link of the rotor of a body's hinge, if it has one."""
     return next((link for link in links.links if link.node == node and isinstance(link.hinge, RotorAxis)), None)

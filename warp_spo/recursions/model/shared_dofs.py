@@ -15,7 +15,7 @@ from __future__ import annotations
 import dataclasses
 from typing import NamedTuple
 
-from ...trace.scalars import Value, guarded, reciprocal, select
+from ...trace.scalars import Value, nan_unless_above, reciprocal, select
 from ...trace.spatial import ZERO, Articulated, Twist, Vector, dot, total
 from ..articulated import LEAST, NO_INERTIA, columns
 from ..motion import VelocityTerms
@@ -96,7 +96,7 @@ def factor(
     least = [LEAST * epsilon * D[i, i] for i in range(n)]
     P = found.whole
     for at in reversed(range(n)):
-        pivot = guarded(guarded(D[at, at], least[at]), 0.0)
+        pivot = nan_unless_above(nan_unless_above(D[at, at], least[at]), 0.0)
         inverse = reciprocal(pivot)
         if held is not None:
             inverse = select(held[at], 0.0, inverse)

@@ -111,8 +111,11 @@ class Actuation:
         """Return the force of an actuator before its strength and gear."""
         return self.push(number, lambda one: self.q(one.coordinate), 0.0).force
 
-    def reach(self, dof: int) -> float:
-        """Return the largest force on a dof within constant ranges of its actuators; infinite where one is not."""
+    def largest_force(self, dof: int) -> float:
+        """Return the largest force of a dof's actuators together; infinite unless ranges and factors are constants.
+
+        An effort limit that is no smaller never acts, and is left out.
+        """
         most = 0.0
         for number, one in self.acting.get(dof, ()):
             ends = self.bounds("actuator_force_range", number)
@@ -254,6 +257,6 @@ def actuator_force(trace: Trace) -> list[Store]:
         trace.label(link, "a")
         for dof in link.dofs:
             force = total(one.gear * strong[number] for number, one in actuation.acting.get(dof, ()))
-            most = None if joint_laws.is_weak(dof, actuation.reach(dof)) else joint_laws.effort_limit(dof)
+            most = None if joint_laws.is_weak(dof, actuation.largest_force(dof)) else joint_laws.effort_limit(dof)
             stores.append(Store("out", (dof,), force if most is None else clip(force, -most, most)))
     return stores

@@ -171,8 +171,11 @@ def _share(law: Law, beside: Value, bound: Value) -> Law:
     )
 
 
-def reach(laws: list[Law]) -> float:
-    """Return a bound of the size of the sum of laws, from bounds that are constants; infinite where one is not."""
+def largest_force(laws: list[Law]) -> float:
+    """Return the largest force that laws can add up to; infinite unless all their bounds are constants.
+
+    An effort limit that is no smaller never acts, and is left out.
+    """
     ends = [(law.scale, law.least, law.most) for law in laws]
     if not all(isinstance(x, float) for end in ends for x in end):
         return np.inf
@@ -224,7 +227,7 @@ class JointLaws:
         dof = link.dofs[i]
         drive, actuators = self._drive(link, i), self.actuators(dof)
         effort = self.effort_limit(dof) if drive or actuators else None
-        if effort is not None and actuators and (drive or not self.is_weak(dof, reach(actuators))):
+        if effort is not None and actuators and (drive or not self.is_weak(dof, largest_force(actuators))):
             return [], limit_sum(drive + actuators, effort)
         return drive if effort is None else limit_sum(drive, effort), actuators
 

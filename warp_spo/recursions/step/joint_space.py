@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from ...trace.scalars import Value, guarded, reciprocal
+from ...trace.scalars import Value, nan_unless_above, reciprocal
 from ..composite import mass_matrix
 from ..newton_euler import inverse_dynamics
 
@@ -43,7 +43,7 @@ class JointSpace:
         sizes = {k: U[k, k] for k in self.dofs}
         for k in reversed(self.dofs):
             self.trace.graph.step = f"dof {k}|D"
-            inverse[k] = reciprocal(guarded(U[k, k], 4.0 * self.trace.epsilon * sizes[k]))
+            inverse[k] = reciprocal(nan_unless_above(U[k, k], 4.0 * self.trace.epsilon * sizes[k]))
             above = [i for i in self.dofs[:k] if (i, k) in U]
             column = {i: U[i, k] * inverse[k] for i in above}
             for i in above:
