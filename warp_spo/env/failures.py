@@ -204,10 +204,8 @@ class FailureRing:
         own, threads = self._wp, kernels.THREADS if self._device.type == "cuda" else 1
         ring = [SLOTS, self._words, self._ring.data_ptr(), own["place"], own["pitch"]]
         failed = [own["fault"], own["status"], len(self._guard), self._counted, FILES_OF_A_CAUSE]
-        written: list[Any] = [
-            own[name] for name in ("taken", "until", "latest", "first", "clock", "files", "chosen", "rows")
-        ]
-        written.append(self._told.data_ptr())
+        names = ("taken", "until", "latest", "first", "clock", "files", "chosen", "rows")
+        written = [*(own[name] for name in names), self._told.data_ptr()]
         self._launch(kernels.find_failures(), threads, [threads, *ring, *failed], written, threads)
 
     def _launch(self, kernel: wp.Kernel, dim: Any, inputs: list, outputs: list, block_dim: int = 256) -> None:
