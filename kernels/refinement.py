@@ -18,16 +18,16 @@ def cast(S, T) -> wp.Kernel:
 
 
 @functools.cache
-def residual(S) -> wp.Kernel:
-    """Compute ``right - force`` in float64 and round it to float32; without ``right``, right is zero."""
+def residual(S, F, T) -> wp.Kernel:
+    """Compute ``T(right - force)`` in float64, of types ``S`` and ``F``; without ``right``, right is zero."""
 
     @wp.kernel(module="unique", enable_backward=False)
-    def kernel(right: wp.array2d[S], force: wp.array2d[wp.float64], residual_out: wp.array2d[wp.float32]):
+    def kernel(right: wp.array2d[S], force: wp.array2d[F], residual_out: wp.array2d[T]):
         world, dof = wp.tid()
         total = wp.float64(0.0)
         if right:
             total = wp.float64(right[world, dof])
-        residual_out[world, dof] = wp.float32(total - force[world, dof])
+        residual_out[world, dof] = T(total - wp.float64(force[world, dof]))
 
     return kernel
 

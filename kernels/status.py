@@ -336,4 +336,25 @@ def mark_unsettled(T) -> wp.Kernel:
     return kernel
 
 
-KERNELS = (lost_digits, status_word)  # at node granularity; mark_unsettled takes a scalar type and has its own module
+@functools.cache
+def mark_correction(T) -> wp.Kernel:
+    """Set DIGITS in worlds whose word is OK and where a ``correction`` of qdd exceeds ``share`` of the largest entry.
+
+    Both are [world, dof]. A correction that is NaN exceeds every share.
+    """
+
+    @wp.kernel(module=f"warp_spo_correction_{T.__name__}", enable_backward=False)
+    def kernel(qdd: wp.array2d[T], correction: wp.array2d[T], share: T, status_out: wp.array[wp.int32]):
+        world = wp.tid()
+        change, largest, lost = T(0.0), T(0.0), T(0.0)
+        for dof in range(qdd.shape[1]):
+            size = wp.abs(correction[world, dof])
+            change, lost = wp.max(change, size), lost + T(0.0) * size
+            largest = wp.max(largest, wp.abs(qdd[world, dof]))
+        if not change + lost <= share * largest and status_out[world] == OK:
+            status_out[world] = DIGITS
+
+    return kernel
+
+
+KERNELS = (lost_digits, status_word)  # at node granularity; the others take a scalar type and have their own modules

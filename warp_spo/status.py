@@ -78,7 +78,8 @@ _ADVICE = {
     Status.OK: "Nothing needs to be done.",
     Status.PIVOT: (
         "Give the joint armature or its body inertia: a massless leaf, three hinges at a gimbal lock and a point mass "
-        "on a ball joint have no positive pivot. Use one ball joint in place of three hinges."
+        "on a ball joint have no positive pivot. Use one ball joint in place of three hinges. In float32 many modes "
+        "of a body with a heavy load leave none: use float64 or fewer modes."
     ),
     Status.NOT_FINITE: (
         "Look for the NaN or the infinity in what the call was given for this world (q, qd, tau, body_f, target_q, "

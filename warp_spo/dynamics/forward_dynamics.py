@@ -10,15 +10,17 @@ import warp as wp
 from ..execution import status_words as words
 from ..execution.node import operations as node_operations
 from ..execution.routine import Routine, SegmentForm, TuningHints
+from ..kernels import refinement as kernels
 from ..recursions import forward_dynamics as recursion
 from ..recursions.derivatives import adjoints
 from ..recursions.loops import embedded_adjoints
+from ..runtime import launches
 from ..runtime.arrays import AnyArray, ArrayT
 from .closures import FORWARD_DYNAMICS as EMBEDDED_FORWARD_DYNAMICS
 from .derivative_references import forward_dynamics_by_q
 from .gradients import by_name
 from .inertia import SOLVE_MASS_MATRIX
-from .inverse_dynamics import DQ, divides_backwards
+from .inverse_dynamics import DQ, INVERSE_DYNAMICS, divides_backwards
 from .operation import (
     AS_WRITTEN,
     BODY_F,
@@ -142,8 +144,9 @@ def forward_dynamics(
               result is NaN where rank is lost, and stands otherwise. Use float64, or stay away from the change point.
             * 0, OK: none of these.
 
-            Where loops are closed, or bodies have modes or rotors, only 11, 2, 6 and 1 are written, because digits are
-            not estimated. Worlds never change each other's result.
+            Where loops are closed, only 11, 2, 6 and 1 are written, because digits are not estimated. Where bodies have
+            modes or rotors, the digits are those that a step of refinement changes, which costs an inverse dynamics
+            and a solve of the mass matrix, and 4 is not written for D. Worlds never change each other's result.
         out: array for the result.
 
     Returns:
@@ -161,10 +164,31 @@ def forward_dynamics(
         else:
             swept = engine.launch(FORWARD_DYNAMICS, qdd, **given)
             if status_words is not None:
-                words.write(self.recursions, **given, qdd=qdd, status=status_words, factored=swept)
+                write_status(self, **given, qdd=qdd, status=status_words, factored=swept)
         if status_words is not None:
             words.check_results(self.recursions, self._coordinate_kinds, given["q"], status_words, rates=qdd)
     return call.result
+
+
+def write_status(
+    dyn: Dynamics, q: wp.array, qd: Any, tau: Any, body_f: Any, qdd: wp.array, status: wp.array, factored: bool,
+    refined: int = 0,
+) -> None:  # fmt: skip
+    """Write ``status`` [world] after forward dynamics without loops; see :func:`words.write`.
+
+    Where links share dofs, the modes of a body take most of the inertia of the hinges inboard of it, and no sweep knows
+    how much is lost in what they leave. There Mass^-1 (tau - inverse_dynamics(qdd)) is an estimate of the error of qdd.
+    """
+    run = dyn.recursions
+    words.write(run, q, qd, tau, body_f, qdd, status, factored, refined)
+    if not dyn.scene.shares_dofs:
+        return
+    force, rest, correction = (run.array(f"{name} of status", *qdd.shape) for name in ("force", "rest", "correction"))
+    dyn._engine.launch(INVERSE_DYNAMICS, force, q=q, qd=qd, qdd=qdd, body_f=body_f)
+    residual = kernels.residual(run.dtype, run.dtype, run.dtype)
+    launches.launch(residual, rest.shape, [tau, force], [rest], device=run.device)
+    dyn._engine.launch(SOLVE_MASS_MATRIX, correction, q=q, b=rest)
+    words.mark_correction(run, qdd, correction, refined, status)
 
 
 def accelerations(dyn: Dynamics, out: wp.array, **given: Any) -> None:

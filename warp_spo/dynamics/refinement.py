@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from ..execution import status_words
 from ..kernels import refinement as kernels
 from ..runtime import launches
-from .forward_dynamics import FORWARD_DYNAMICS
+from .forward_dynamics import FORWARD_DYNAMICS, write_status
 from .inertia import SOLVE_MASS_MATRIX
 from .inverse_dynamics import INVERSE_DYNAMICS
 
@@ -50,7 +49,7 @@ class Refinement:
         swept = narrow._engine.launch(FORWARD_DYNAMICS, x, tau=right, **low)
         if status is not None:
             found = low["q"], low["qd"], right, low["body_f"], x, status
-            status_words.write(narrow.recursions, *found, factored=swept, refined=self.steps)
+            write_status(narrow, *found, factored=swept, refined=self.steps)
         self._refine(low["q"], x, tau, out, **high)
 
     def solve_mass_matrix(self, q: wp.array, b: wp.array, out: wp.array) -> None:
@@ -75,7 +74,7 @@ class Refinement:
         self._launch(kernels.cast(wp.float32, wp.float64), [x], total)
         for _ in range(self.steps):
             self.wide._engine.launch(INVERSE_DYNAMICS, force, qdd=total, **given)
-            self._launch(kernels.residual(out.dtype), [right, force], rest)
+            self._launch(kernels.residual(out.dtype, wp.float64, wp.float32), [right, force], rest)
             self.narrow._engine.launch(SOLVE_MASS_MATRIX, step, q=at, b=rest)
             self._launch(kernels.add(), [step], total)
         if total is not out:

@@ -32,9 +32,9 @@ def write(
 
     The sweep reads pose, axis, articulated, gain and pivot. With ``factored``, forward dynamics has left them in the
     workspace. Otherwise a generated kernel computed forward dynamics, and the sweeps factorise now. The digits that
-    they lose are an upper bound for the generated kernel, whose hinges lie along axes. Where links share dofs, digits
-    are not estimated: a world is NOT_FINITE, PIVOT or OK. Each of the steps by which qdd is ``refined`` later
-    multiplies the error of torques that nearly cancel the other loads by itself.
+    they lose are an upper bound for the generated kernel, whose hinges lie along axes. Where links share dofs, no
+    sweep estimates them: a world is NOT_FINITE, PIVOT or OK, and :func:`mark_correction` may follow. Each of the steps
+    by which qdd is ``refined`` later multiplies the error of torques that nearly cancel the other loads by itself.
     """
     if run.scene.shares_dofs:
         write_of_rank(run, q, qd, tau, body_f, qdd, run.array("no margin", run.worlds, 0), 0.0, status)
@@ -58,6 +58,16 @@ def write(
     allowed = run.dtype(0.25 * epsilon ** (0.5 / (refined + 1) - 1.0))
     loads: list[Any] = [q, qd, tau, body_f]
     run.launch_nodes(kernels.status_word, run.worlds, [*loads, *values, factors[2], allowed, lost, qdd], [status])
+
+
+def mark_correction(run: Sweeps, qdd: wp.array, correction: wp.array, refined: int, status: wp.array) -> None:
+    """Set DIGITS in worlds that are OK and whose qdd [world, dof] a correction changes in the first half of the digits.
+
+    Each of the steps by which qdd is ``refined`` later multiplies its error by that of a solve, which may be several
+    times larger than that of qdd where forces hardly excite what is lost: then a quarter is allowed.
+    """
+    share = run.dtype((0.25 if refined else 1.0) * EPSILON[run.dtype] ** (0.5 / (refined + 1)))  # type: ignore[index]
+    run.launch(kernels.mark_correction, run.worlds, [qdd, correction, share], [status])
 
 
 def write_of_rank(
