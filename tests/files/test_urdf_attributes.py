@@ -49,7 +49,7 @@ PLANTED = {
     "velocity": lambda: changed(urdf, "_limits", without("velocity_limit")),
     "lower": lambda: changed(urdf, "_limits", without("limit_lower")),
     "axis": lambda: changed(urdf, "_axis", lambda axis: np.roll(axis, 1)),
-    "order of turns": lambda: changed(urdf, "_origin", lambda pose: (pose[0], pose[1] * [-1, 1, 1, 1])),
+    "order of turns": lambda: changed(urdf, "origin_of", lambda pose: (pose[0], pose[1] * [-1, 1, 1, 1])),
     "frame of an inertia": lambda: changed(urdf, "_rotation", lambda turn: turn.T),
     "mimics": lambda: changed(urdf, "read_mimics", lambda mimics: mimics._replace(couplings=[
         one.__class__(one.hinge, one.reference, one.ratio, 0.0) for one in mimics.couplings])),
