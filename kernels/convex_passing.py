@@ -6,6 +6,9 @@ steps of the distance over the speed along the normal (conservative advancement,
 would carry it into each other by SKIMS of the smaller shape's least half size. If it does not touch within the step, or
 is then less than half as deep as the speed along the normal says, it passes by. Shapes that overlap by up to LIES are
 looked at as well: where a body lies a little below the top that it slides onto, the side may be the nearest way out.
+
+The law of a point takes it where it would touch in the step if it came nearer by g h^2 / 2, whatever its normal. So
+such pairs are looked at, too, and moved for as long as their speed alone takes to bring them together.
 """
 
 NATIVE = r"""
@@ -43,10 +46,12 @@ NATIVE = r"""
         }
     };
 
-    // Finds the point that comes nearest in the step, and the relative velocity there; returns whether none is
-    // deeper than LIES and it meets. Not of bodies that turn by more than TURNED: they are moved without turning.
+    // Finds the point that comes nearest in the step, the relative velocity there, and the time until it meets, a step
+    // or longer; returns whether none is deeper than LIES and that one may push: the law of a point takes it where it
+    // comes as near as ``fall``, by which bodies fall in a step. Not of bodies that turn by more than TURNED: they are
+    // moved without turning. Nor where they meet only after two steps, and farther on than they are moved to skim.
     static CUDA_CALLABLE inline bool approach(const Motion& motion, const REAL* points, int count, REAL least,
-        REAL* drift)
+        REAL fall, REAL* drift, REAL& until)
     {
         const REAL faint = (REAL)FAINT * least, allowed = (REAL)LIES * least;
         REAL most = -NONE, fastest = 0;
@@ -69,7 +74,10 @@ NATIVE = r"""
             UNROLL
             for (int r = 0; r < 3; ++r) drift[r] = u[r];
         }
-        return apart && fastest > faint && most > -faint;
+        if (!apart || !(fastest > faint) || !(most > -faint - fall)) return false;
+        until = most < 0 ? motion.h * (1 + (faint - most) / fastest) : motion.h;
+        const REAL room = 4 * (REAL)SKIMS * least;
+        return until < 2 * motion.h || until * until * dot(drift, drift) < room * room;
     }
 
     static CUDA_CALLABLE inline REAL least_of(const Shape& one, const Shape& other)
@@ -78,10 +86,10 @@ NATIVE = r"""
         return x < y ? x : y;
     }
 
-    // Whether the first shape, which moves by ``u`` against the other one, passes by within ``h``.
+    // Whether the first shape, which moves by ``u`` against the other one, passes by within ``until``, ``h`` or longer.
     static CUDA_CALLABLE inline bool passes_by(const Shape& one, const Shape& other, const Tables& tables,
         const REAL* at, const REAL* turn_of, const REAL* other_at, const REAL* other_turn_of, REAL reach,
-        const REAL* u, REAL h)
+        const REAL* u, REAL h, REAL until)
     {
         Two two;
         REAL turn[9], here[3], ahead[3], drift[3], time = 0, expected = 0;
@@ -101,7 +109,7 @@ NATIVE = r"""
             if (!(closing > 0)) return true;
             REAL step = gap / closing;
             if (gap > (REAL)FAINT * least) {
-                if (time + step > h) return true;
+                if (time + step > until) return true;
             } else {
                 touched = true;
                 step = (REAL)SKIMS * least / closing;

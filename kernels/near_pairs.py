@@ -236,12 +236,14 @@ for (int side = 0; side < 2; ++side) {
     turned::by(own + 7 * body + 3, sides.data + (2 * pair + side) * SIDE + COM, motion.com[side]);
     for (int c = 0; c < 3; ++c) motion.com[side][c] += own[7 * body + c];
 }
-REAL u[3];
+REAL u[3], until;
 const REAL least = convex::least_of(shape[0], shape[1]);
-if (!convex::approach(motion, touches.data + (world * NEAR + k) * (MOST * POINT), list[1 + NEAR + k], least, u)) return;
+const REAL* const points = touches.data + (world * NEAR + k) * (MOST * POINT);
+if (!convex::approach(motion, points, list[1 + NEAR + k], least, fall, u, until)) return;
 """,
     "LAST": r"""
-if (convex::passes_by(shape[0], shape[1], tables, at[0], turn[0], at[1], turn[1], reach, u, h)) list[1 + NEAR + k] = 0;
+if (convex::passes_by(shape[0], shape[1], tables, at[0], turn[0], at[1], turn[1], reach, u, h, until))
+    list[1 + NEAR + k] = 0;
 """,
 }
 """Text of the narrow phase, and of the kernel that follows it: what they do first, between, and last in PAIR."""
@@ -288,9 +290,12 @@ def narrow(pairs: int, near: int, T: type, routines: tuple[str, ...]) -> wp.Kern
 
 @functools.cache
 def passing(pairs: int, near: int, T: type, routines: tuple[str, ...]) -> wp.Kernel:
-    """Take away the points of pairs that pass beside each other; arguments and threads of :func:`narrow`."""
+    """Take away the points of pairs that pass beside each other; arguments and threads of :func:`narrow`.
+
+    Before these comes ``fall``: how far bodies fall in a step from rest [m], by which the law of a point looks ahead.
+    """
     text = convex_pairs.definition(T, routines, passing=True) + pair_text(PASSING, pairs, near, T)
-    return native.kernel("passing_pairs", text, ARRAYS, T)
+    return native.kernel("passing_pairs", text, [("fall", 0), *ARRAYS], T)
 
 
 def pair_text(parts: dict[str, str], pairs: int, near: int, T: type) -> str:

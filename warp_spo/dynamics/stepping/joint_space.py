@@ -243,8 +243,9 @@ class JointSpaceStep:
         shapes = [self.poses, self.velocities, self.which, self.sides, slack, dt]
         self._launch(self.broad, a_world * self.worlds, shapes, [self.near], 128)
         threads = self.near_count * self.worlds
-        for kernel in (self.narrow, self.passing):
-            self._launch(kernel, threads, [*shapes, *self.shapes, self.near], [self.touches])
+        given = [*shapes, *self.shapes, self.near]
+        self._launch(self.narrow, threads, given, [self.touches])
+        self._launch(self.passing, threads, [0.5 * self.gravity * dt * dt, *given], [self.touches])
 
     def solve(
         self,
