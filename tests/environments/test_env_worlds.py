@@ -656,3 +656,24 @@ def test_first_gaps_of_the_tasks_are_those_of_a_step_from_there(task):
     held = env._tensors["contact_gap"]
     seen = held.abs().max(dim=0).values > 0
     assert seen.sum() >= 4 and torch.allclose(held[:, seen], report.contact_gap[:, seen], atol=FLOAT32)
+
+
+def test_first_gaps_of_all_shapes_over_a_field_are_those_of_a_step():
+    """Two boxes lie 1 cm above a ridge: the second gap was that of a shape that the step does not reach."""
+    contacts = [spo.Contact(i, box=(0.1, 0.1, 0.05), label=f"box{i}") for i in range(2)]
+    bodies = [spo.Body(1.0, inertia=np.eye(3) * 0.01, label=f"body{i}") for i in range(3)]
+    hinges = [spo.Hinge("free", -1, i, label=f"base{i}") for i in range(2)]
+    hinges.append(spo.Hinge("revolute", -1, 2, axis=(0, 1, 0), label="spin"))
+    roof = np.array([[0.0, 0.2, 0.0]] * 2)
+    scene = spo.Scene(bodies, hinges, contacts=contacts, ground=spo.HeightField(roof, (2.0, 1.0), origin=(-1.0, -1.0)))
+    start = [-0.5, 0.0, 0.26, 0, 0, 0, 1, 0.5, 0.0, 0.26, 0, 0, 0, 1, 0.0]
+    observed = {"a": [lambda w: w.contact_gap]}
+    spin = actions.Effort("spin")
+    env = envs.Env(
+        scene, 2, "cpu", actions=spin, observations=observed, rewards={}, default_q=start, episode_length_s=1
+    )
+    report = env.dyn.step_report("contact_gap", like=env.q)
+    env.dyn.step(env.q, env.qd, None, env._layout.dt, report=report)
+    found = env.get_observations()["a"]
+    assert (report.contact_gap.amin(dim=1) < 0.011).all()
+    np.testing.assert_allclose(found, report.contact_gap, atol=FLOAT32)

@@ -168,14 +168,16 @@ def place_points(
     ``oriented``: with the inertial directions x, y, z in the axes of their links. ``branches``: code may leave out
     points where their surface is not near. ``gaps``: of spheres over a field are distances to the nearest point up to
     SEEN radii; beyond, they are vertical, as all are without it that the step cannot close. ``ahead``: the time [s]
-    within which shapes have to touch the grid of a field to be seen there; the step's if left out. ``carry``: returns
+    within which shapes have to touch the grid of a field to be seen there; None: what is left of the step. ``carry``: returns
     what points and further links read of a link, on the way to any point of the scene; None: what was computed.
     """
     scene = trace.links.scene
     ground, weights = scene.ground, inverse_weights(scene)
     assert ground is not None
     half_way, still = KICK in trace.inputs, (ZERO, ZERO)
-    ahead = joint_laws.h if ahead is None else ahead
+    h = joint_laws.h
+    step_left = 0.5 * h if half_way else h
+    ahead = step_left if ahead is None else ahead
     path = trace.vector(PATH) if half_way else qd
     place_of_ground = ground_offset(joint_laws)
     seats = {at: _contact_placement(trace, at, body, place) for at, body, place in _point_positions(trace, joint_laws)}
@@ -245,12 +247,11 @@ def place_points(
         k, d, mu = (joint_laws.value(f"contact_{name}", number) for name in ("stiffness", "damping", "friction"))
         turned = mine.axes[-len(IDENTITY) :] if oriented else []
         turning = _turning_friction(joint_laws, number, eps)
-        h, moving = joint_laws.h, mine.motion
+        moving = mine.motion
         bend = mine.bend[1] + cross(mine.bend[0], hub)
         bend = bend if moving is None else bend + moving.whirl @ hub
         w, v = mine.travel
-        ahead = 0.5 * h if half_way else h
-        moves = [ahead * dot(axis, v + cross(w, centre)) for axis in toward]
+        moves = [step_left * dot(axis, v + cross(w, centre)) for axis in toward]
         if isinstance(ground, Listed):
             touched = [_listed_surface(joint_laws, number)]
         elif grid is not None:
