@@ -132,7 +132,7 @@ def _sixes(values: list[Value]) -> list[list[Value]]:
 def mass_matrix_inverse(trace: Trace) -> list[Store] | StepPhases:
     """out = Mass^-1, both triangles"""
     if trace.exchange.alone:
-        return by_columns(trace) if trace.links.shares_dofs else _by_segments(trace)
+        return by_columns(trace) if trace.links.shares_dofs else _in_one_trace(trace)
     inverse, phases = Inverse(trace), PhaseBuilder()
     for entries in inverse.shared_entries:
         phases.add_final_stores(mirror(entries))
@@ -141,8 +141,8 @@ def mass_matrix_inverse(trace: Trace) -> list[Store] | StepPhases:
     return phases.phases
 
 
-def _by_segments(trace: Trace) -> list[Store]:
-    """out = Mass^-1, both triangles, where one evaluation takes all segments"""
+def _in_one_trace(trace: Trace) -> list[Store]:
+    """out = Mass^-1, both triangles, of the whole tree in one trace, as one thread works through it"""
     inverse = Inverse(trace)
     return mirror(inverse.entries) + [item for entries in inverse.shared_entries for item in mirror(entries)]
 
@@ -160,4 +160,4 @@ def by_columns(trace: Trace) -> list[Store]:
 
 def mass_matrix_inverse_packed(trace: Trace) -> list[Store]:
     """out = the entries of Mass^-1 within one tree, lower triangle, row after row"""
-    return pack(by_columns(trace) if trace.links.shares_dofs else _by_segments(trace))
+    return pack(by_columns(trace) if trace.links.shares_dofs else _in_one_trace(trace))

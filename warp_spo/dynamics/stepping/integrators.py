@@ -133,10 +133,13 @@ def semi_implicit(
         write_bodies(dyn, q_out, qd_out, bodies)
 
 
-def arrays_of_bodies(dyn: Dynamics, states: dict[str, Any]) -> tuple[wp.array, wp.array]:
-    """Return the arrays for poses and velocities of the bodies; one that is not given comes from the workspace."""
+def arrays_of_bodies(dyn: Dynamics, asked: dict[str, Any]) -> tuple[wp.array, wp.array]:
+    """Return the arrays for poses and velocities of the bodies.
+
+    Kernels write both. ``asked`` has those of them that the caller of a step gave; the other comes from the workspace.
+    """
     poses, velocities = (
-        states[name] if name in states else dyn.recursions.array(f"{name} of a step", *dyn._engine.shape(axes)[0])
+        asked[name] if name in asked else dyn.recursions.array(f"{name} of a step", *dyn._engine.shape(axes)[0])
         for name, axes in BODIES.items()
     )
     return poses, velocities

@@ -171,7 +171,8 @@ class _SegmentProgram:
     def _fits(self, layout: KernelLayout) -> bool:
         """Whether shared memory has room for the result, for messages of segments, and for the states of bodies.
 
-        The result without room matters more than a thread a segment; another kernel then writes the states of bodies.
+        Where it has not, there is no program by segments. A thread then takes a whole tree; states of bodies alone are
+        left to another kernel.
         """
         form, options = self.form, self.job.options
         if layout.result.way == DIRECT and layout.result.array.entries > staging.LONG_ROW:

@@ -166,10 +166,11 @@ def place_points(
     """Return the contact points that a trace works on, one for each surface that a point may touch.
 
     ``oriented``: with the inertial directions x, y, z in the axes of their links. ``branches``: code may leave out
-    points where their surface is not near. ``gaps``: of spheres over a field are distances to the nearest point up to
-    SEEN radii; beyond, they are vertical, as all are without it that the step cannot close. ``ahead``: the time [s]
-    within which shapes have to touch the grid of a field to be seen there; None: what is left of the step. ``carry``: returns
-    what points and further links read of a link, on the way to any point of the scene; None: what was computed.
+    points where their surface is not near. ``gaps``: somebody reads the gaps; a sphere over a field then looks SEEN
+    radii far for the nearest point, otherwise only as far as the step may bring it, and a gap beyond is vertical.
+    ``ahead``: the time [s] within which shapes have to touch the grid of a field to be seen there; None: what is left
+    of the step. ``carry``: called with each link that leads to a point, and its motion; points and links further out
+    read what it returns, as gradients want it that cut the trace into parts. None: the motion itself.
     """
     scene = trace.links.scene
     ground, weights = scene.ground, inverse_weights(scene)
@@ -206,8 +207,8 @@ def place_points(
             assert isinstance(ground, HeightField) and point.support is not None
             if point.contact not in searches:
                 at = [origin + dot(axis, centre) for origin, axis in zip(mine.origins, toward, strict=True)]
-                below = _way_down(mine.travel, centre, total(_support_values(trace, number)[1]), ahead)
-                shape = _shape_over(trace, number, ground, place_of_ground, at, toward, radius, below)
+                way_down = _way_down(mine.travel, centre, total(_support_values(trace, number)[1]), ahead)
+                shape = _shape_over(trace, number, ground, place_of_ground, at, toward, radius, way_down)
                 searches[point.contact] = shape, find(trace.graph, ground, place_of_ground, shape)
             shape, rows = searches[point.contact]
             row = rows[ROW * point.support.number : ROW * (point.support.number + 1)]
@@ -258,29 +259,30 @@ def place_points(
             touched = [grid.surface]
         elif rolls and isinstance(ground, HeightField):
             second = surface_count(ground, place_of_ground.varies, point.walls, rolls) == 2
-            cells, below = ring(ground, point.radius), radius + _way_down(mine.travel, centre, radius, ahead)
+            cells, field_below = ring(ground, point.radius), radius + _way_down(mine.travel, centre, radius, ahead)
             if gaps:
-                below = select(less(below, SEEN * radius), SEEN * radius, below)
-            touched = sphere_surfaces(trace.graph, ground, at, place_of_ground, radius, cells, second, below)
+                field_below = select(less(field_below, SEEN * radius), SEEN * radius, field_below)
+            touched = sphere_surfaces(trace.graph, ground, at, place_of_ground, radius, cells, second, field_below)
         else:
             touched = surfaces(trace.graph, ground, at, place_of_ground, moves, point.walls)
         for normal, depth, cell, near in touched:
             inward = Vector(total(n * axis[c] for n, axis in zip(normal, toward, strict=True)) for c in range(3))
             arm = centre - inward * radius if rolls else arm
             depth = select(there, depth, AWAY)
-            faster = h * (dot(inward, bend) if more is None else dot(inward, bend) + more)
+            speed_gained = h * (dot(inward, bend) if more is None else dot(inward, bend) + more)
             if half_way:  # half a step back, along a parabola
-                depth = depth + (0.5 * h) * dot(inward, v + cross(w, arm)) - (0.125 * h) * faster
-            below = depth if half_way else depth - (0.5 * h) * faster
+                depth = depth + (0.5 * h) * dot(inward, v + cross(w, arm)) - (0.125 * h) * speed_gained
+            # of a whole step at whose end the point does not move along n: the parabola leads h^2 bend / 2 further out
+            depth_after = depth if half_way else depth - (0.5 * h) * speed_gained
             damping = d * (k * select(less(0.0, depth), depth, 0.0)) if point.dissipates else d
             deep: Value = 0.0
             if point.is_slow and not isinstance(ground, Listed):
-                slow = k * (below * (1.0 / PUSH_OUT) - h)  # at PUSH_OUT the force is zero
+                slow = k * (depth_after * (1.0 / PUSH_OUT) - h)  # at PUSH_OUT the force is zero
                 deep = less(damping, slow)
                 damping = select(deep, slow, damping)
             material = k, damping, mu, eps, weight
-            push = k * below if half_way else k * below - damping * faster
-            state: Any = (turned, below, push, cell, near if branches else None, lever, turning, deep)
+            push = k * depth_after if half_way else k * depth_after - damping * speed_gained
+            state: Any = (turned, depth_after, push, cell, near if branches else None, lever, turning, deep)
             found.append(TracedContactPoint(number, on, arm, inward, -depth, mine.twist, *material, *state))
     return found
 

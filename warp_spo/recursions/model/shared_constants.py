@@ -41,32 +41,35 @@ class SharedConstants:
         self._coordinates = {entry: at for at, entry in enumerate(entries)}
         self._points = {point: at for at, point in enumerate(points)}
         for at, link in enumerate(segment.links):
-            self._take_link(at, link)
+            self._register_link(at, link)
 
-    def take(self, key: tuple, value: Value) -> Value:
-        """Return a value; a constant that shall not fold as a scalar."""
+    def register(self, key: tuple, value: Value) -> Value:
+        """Note a constant under its key, and return it: a number, which folds, or a scalar if ``unfolded`` has the key.
+
+        A value that is no constant is returned as it is.
+        """
         if not is_constant(value):
             return value
         self.by_key[key] = float(value)
         return number(self.graph, float(value), *key) if key in self.unfolded else value
 
     def of_scene(self, name: str, index: int, value: Value) -> Value:
-        """Return the same for an entry of one of the scene's values."""
+        """Register an entry of one of the scene's values if it belongs to the segment; return any other as it is."""
         places = self._coordinates if name in OF_COORDINATES else self._points if name in OF_POINTS else self._dofs
         by_entry = name.startswith("joint_") or name in (*OF_COORDINATES, *OF_POINTS)
-        return self.take((name, places[index]), value) if by_entry and index in places else value
+        return self.register((name, places[index]), value) if by_entry and index in places else value
 
     def of_point(self, point: int, name: str, values: Iterable[Value]) -> list[Value]:
-        """Return the same for numbers of a contact point."""
-        return [self.take((name, self._points[point], at), value) for at, value in enumerate(values)]
+        """Register numbers of a contact point, and return what :meth:`register` does."""
+        return [self.register((name, self._points[point], at), value) for at, value in enumerate(values)]
 
     def of_body(self, at: int, name: str, values: Iterable[Value]) -> list[Value]:
-        """Return the same for numbers of the segment's ``at``-th body."""
-        return [self.take((name, at, i), value) for i, value in enumerate(values)]
+        """Register numbers of the segment's ``at``-th body, and return what :meth:`register` does."""
+        return [self.register((name, at, i), value) for i, value in enumerate(values)]
 
-    def _take_link(self, at: int, link: Link) -> None:
-        """Replace the constants of a link that shall not fold."""
-        read = lambda name, values: [self.take((name, at, i), x) for i, x in enumerate(values)]  # noqa: E731
+    def _register_link(self, at: int, link: Link) -> None:
+        """Register the constants of a link, and put what :meth:`register` returns in their places."""
+        read = lambda name, values: [self.register((name, at, i), x) for i, x in enumerate(values)]  # noqa: E731
         if all(map(is_constant, (x for row in link.matrix or () for x in row))):
             link.rest = Vector(read("rest", link.hinge.quaternion_at_rest(link)))
         rows = read("matrix", (x for row in (link.matrix or IDENTITY) for x in row))
