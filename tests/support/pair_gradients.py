@@ -13,7 +13,8 @@ SHAPES = {
     "box": dict(box=((TIP, 0.04, 0.03), (0.0, 0.0, 0.0, 0.02, 0.03, 0.05, np.sqrt(1.0 - 0.0038)))),
 }
 FOURTH = ((1.0, 8.0), (-1.0, -8.0), (2.0, -1.0), (-2.0, 1.0))  # moves, and weights in twelve steps
-SIZES = {"x": 1e-6, "qd": 1e-5, "tau": 1e-3, "body_f": 1e-3, "target_q": 1e-4, "target_qd": 1e-4, "ctrl": 2e-3}
+SIZES = {"x": 1e-6, "qd": 1e-5, "tau": 1e-3, "body_f": 1e-3, "target_q": 1e-4, "target_qd": 1e-3, "ctrl": 2e-3}
+# By target_qd, moves of 1e-4 leave 2.5e-6 of the gradient to rounding of the state, and 1e-5 ten times that.
 SAME = 1e-4  # share of an entry by which differences of two sizes agree where there is no switch
 
 
