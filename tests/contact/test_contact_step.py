@@ -225,8 +225,8 @@ BUGS = {
     "points half way": (points, "place_points", "depth + (0.5 * h)", "depth + (0.4 * h)"),
     "weights of the neutral pose": (step.ContactStepTrace, "_step_over_inertia", "not in single_dofs",
                                     "in single_dofs"),
-    "straight paths": (points, "place_points", "(0.5 * h) * faster", "0.0"),
-    "damper of straight paths": (points, "place_points", "k * below - damping * faster", "k * below"),
+    "straight paths": (points, "place_points", "(0.5 * h) * speed_gained", "0.0"),
+    "damper of straight paths": (points, "place_points", "k * depth_after - damping * speed_gained", "k * depth_after"),
     "damping that does not grow": (points, "place_points", "d * (k * select(less(0.0, depth), depth, 0.0))", "d"),
     "tangent friction": (law, "friction_damper", "inverse_root(w * w + point.eps * point.eps)",
                          "inverse_root(w * w + point.eps * point.eps) * inverse_root(w * w + point.eps * point.eps)"
