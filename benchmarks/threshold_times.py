@@ -29,7 +29,7 @@ from . import command_line
 
 
 class Asked(NamedTuple):
-    """What a task is asked for.
+    """The threshold of a task.
 
     Attributes:
         least, most: limits of figures of ``play --measure``, by their names. seconds: from the command.

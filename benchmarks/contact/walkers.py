@@ -123,7 +123,7 @@ def roll(dyn: spo.Dynamics, q: Any, qd: Any, ctrl: Any, dt: float, seconds: floa
     return Motion(q.numpy(), qd.numpy(), said | status.numpy(), np.array(bases), every * dt)
 
 
-def thrown(walker: Walker, way: str, dt: float, dyn: spo.Dynamics) -> Iterator[Figure]:
+def throw(walker: Walker, way: str, dt: float, dyn: spo.Dynamics) -> Iterator[Figure]:
     """Yield how many worlds are lost in a second."""
     scene, worlds = walker.scenes[way], dyn.worlds
     ctrl = scene.keyframes[walker.key].ctrl if way == "drives" else None
@@ -216,7 +216,7 @@ def main(arguments: list[str] | None = None) -> int:
             dyn = spo.Dynamics(walker.scenes[way], options.worlds, device)
             for step in options.steps:
                 if "throws" in options.parts:
-                    note(robot, step, thrown(walker, way, 1e-3 * step, dyn))
+                    note(robot, step, throw(walker, way, 1e-3 * step, dyn))
                 if "rest" in options.parts and way == "drives":
                     note(robot, step, at_rest(walker, 1e-3 * step, options.seconds, dyn))
         if "rest" in options.parts:

@@ -43,7 +43,7 @@ def test_a_walker_is_not_lost_and_stands_as_in_mujoco(device):
     for way in walkers.WAYS:
         dyn = spo.Dynamics(walker.scenes[way], 16, device)
         for dt in (5e-3, 1e-2):
-            assert all(one.value == 0.0 for one in walkers.thrown(walker, way, dt, dyn)), (way, dt)
+            assert all(one.value == 0.0 for one in walkers.throw(walker, way, dt, dyn)), (way, dt)
         if way == "drives":
             ours = list(walkers.at_rest(walker, 5e-3, 1.0, dyn))
     for found in (ours, list(walkers.at_rest_in_mujoco(walker, 1.0, 2))):

@@ -501,7 +501,7 @@ def test_a_unit_that_is_none_is_named(tmp_path):
 @pytest.mark.parametrize("lie", ["y up", "z up"])
 def test_the_up_axis_of_meshes_counts_where_the_joints_bear_it_out(lie, tmp_path):
     """Files say Y_UP. Links hang down to the next joint: so do meshes that lie with y up, as iCub's, and meshes that do
-    not, as those of MeshLab. What is drawn and what touches are the same."""
+    not, as those of MeshLab. Drawn and touching shapes are the same."""
     pytest.importorskip("collada")
     wanted = np.array([[-0.02, -0.03, -0.3], [0.02, -0.03, -0.3], [0.0, 0.04, -0.3], [0.005, 0.01, 0.02]])
     x, y, z = wanted.T

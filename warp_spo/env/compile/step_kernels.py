@@ -483,7 +483,7 @@ class Tracing:
     def _keep(self, w: World, name: str, values: Vector) -> None:
         """Store numbers of memory; not those of a term that no reset would clear, if they are not finite.
 
-        The world would end in each step from then on. What is kept at the start is stored, so that it is seen.
+        The world would end in each step from then on. The memory kept at the start is stored, so that it is seen.
         """
         start, _, reset = self.layout.memory[name]
         if reset is None and w._stage.name != "start" and not is_own(name):

@@ -1,7 +1,7 @@
 """Which axis of a robot's COLLADA meshes is up: of two readings, the one that fits its joints and masses.
 
 A COLLADA file names its up axis. RViz, MoveIt and Gazebo do not turn meshes by it, and most robots are written for
-that: MeshLab says Y_UP of any mesh. The meshes of others, such as iCub, do lie with y up. What a file says therefore
+that: MeshLab says Y_UP of any mesh. The meshes of others, such as iCub, do lie with y up. Its axis therefore
 counts where the robot bears it out: the boxes of meshes, turned, hold the origins of their links, the joints that they
 carry and the centres of mass, and as they are they do not.
 """
