@@ -35,8 +35,8 @@ class CapturedPPO(PPO):
 
     An update reads the device once. The learning rate lives on the device, where an adaptive one follows the KL
     divergence. Actor and critic run on two streams, or on a CPU in two threads. Several processes average gradients,
-    KL divergences and normalisers inside of the update's graph. Other networks learn as in rsl_rl, and a
-    warning says why.
+    KL divergences and normalisers inside of the update's graph.
+    A learner that cannot be captured learns as in rsl_rl, and a warning says why.
 
     Attributes:
         obstacle: why it learns as in rsl_rl; "" where it does not. deviation: mean deviation of actions.
